@@ -1,0 +1,109 @@
+"""What a light basis and an exit basis are: the two ends of a transfer tensor.
+
+Radiance is ``exit(view) · transfer · light_basis.project(environment)``. A transfer function of
+the light direction is the sum of its *values* times the basis functions; light enters as its
+inner products with them. Where the basis is not orthonormal, norms go through :meth:`gram`.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Radiance(Protocol):
+    """Distant light that can be integrated: an environment map, or anything like one."""
+
+    def sample_blocks(self, max_spacing: float) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Yield directions "k 3", solid angles "k" [sr] and radiance "k rgb" that tile the sphere.
+
+        No sample may stand for a piece of the sphere wider than ``max_spacing`` [rad].
+        """
+        ...
+
+
+class LightBasis(ABC):
+    """Functions on the sphere that distant light is expanded in, in world coordinates."""
+
+    @property
+    @abstractmethod
+    def num_coeffs(self) -> int:
+        """How many functions the basis has."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Short name for tables, such as ``SH order 6``."""
+
+    @abstractmethod
+    def project(self, environment: Radiance) -> Float[Tensor, "coeffs rgb"]:
+        """Inner products of the light with each basis function, float64.
+
+        Every source pixel enters with its exact solid angle, so no light is lost or made; linear
+        and differentiable in the image.
+        """
+
+    @abstractmethod
+    def project_cube(
+        self, values: Float[Tensor, "points texels"], resolution: int
+    ) -> Float[Tensor, "points coeffs"]:
+        """Expansion coefficients of functions given by cube-map texels.
+
+        Args:
+            values: Function times solid angle at each texel centre, ``"6 row col"`` flattened.
+            resolution: Texels along an edge of a face.
+        """
+
+    @abstractmethod
+    def table_bytes(self, resolution: int) -> int:
+        """Memory that :meth:`project_cube` keeps for this resolution between calls."""
+
+    @abstractmethod
+    def gram(self) -> Float[Tensor, "coeffs coeffs"] | Float[Tensor, "coeffs"]:
+        """Inner products of the basis functions, float64; a vector where it is diagonal."""
+
+    @abstractmethod
+    def rotate(
+        self, coefficients: Float[Tensor, "*batch coeffs rgb"], rotation: Float[Tensor, "3 3"]
+    ) -> Float[Tensor, "*batch coeffs rgb"]:
+        """Light coefficients of the light turned by ``rotation``: L'(s) = L(R⁻¹ s).
+
+        Exact for a basis that is closed under rotation; otherwise resampled, which the basis'
+        docstring states.
+        """
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """What :func:`prt_torch.bases.light_basis` needs to make this basis again; plain JSON."""
+
+    def squared_norm(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "..."]:
+        """Squared L2 norm over the sphere of the functions with these expansion coefficients."""
+        values = values.to(torch.float64)
+        gram = self.gram().to(values.device)
+        weighted = values * gram if gram.ndim == 1 else values @ gram
+        return (weighted * values).sum(-1)
+
+
+class ExitBasis(ABC):
+    """Functions of the view direction, in the shading frame, that radiance leaves in."""
+
+    @property
+    @abstractmethod
+    def num_rows(self) -> int:
+        """How many functions the basis has."""
+
+    @property
+    @abstractmethod
+    def view_dependent(self) -> bool:
+        """Whether radiance depends on the view; if not, relighting skips views altogether."""
+
+    @abstractmethod
+    def evaluate(self, view: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rows"]:
+        """Basis functions at unit view directions in the shading frame."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """What :func:`prt_torch.bases.exit_basis` needs to make this basis again; plain JSON."""

@@ -1,0 +1,200 @@
+r"""Real spherical harmonics: evaluation, exact rotation, projection of light.
+
+Orthonormal, without the Condon-Shortley phase, index ``l * (l + 1) + m``
+(:mod:`prt_torch.conventions`). Functions are evaluated as polynomials in x, y, z,
+
+.. math:: y_{lm}(s) = \hat P_{lm}(z) \cdot
+    \begin{cases} \Re (x + iy)^m & m \ge 0 \\ \Im (x + iy)^{|m|} & m < 0 \end{cases}
+
+where :math:`\hat P_{lm}` is the normalised associated Legendre function without its factor
+:math:`(1-z^2)^{m/2}`, so nothing divides by a sine, the poles are ordinary points and gradients
+exist everywhere. The fully normalised recurrence never overflows: order 33 has a largest absolute
+error near 4e-5 in float32 and 1e-12 in float64.
+
+Rotations are exact quadratures. Products of two functions of degree below ``order`` are integrated
+without error by Gauss-Legendre nodes in z times equal steps in azimuth, so
+:math:`D_l = \int y_l(s)\, y_l(R^{-1}s)^T ds` needs no recurrence and no Euler angles, has no
+singular rotation, and is differentiable in R.
+"""
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from prt_torch.bases.base import LightBasis, Radiance
+from prt_torch.conventions import sh_index
+from prt_torch.sphere import cubemap_directions
+
+MAX_ORDER = 128
+
+_TABLE_ELEMENTS = 2**23  # of one table of function values: 64 MiB in float64
+_TEXEL_RUN = 2048  # summed in the type of the values before the sum goes on in float64
+
+
+def _check_order(order: int) -> None:
+    if not 1 <= order <= MAX_ORDER:
+        raise ValueError(f"expected a spherical-harmonic order in 1..{MAX_ORDER}, got {order}")
+
+
+def evaluate(directions: Float[Tensor, "*batch 3"], order: int) -> Float[Tensor, "*batch coeffs"]:
+    """Spherical harmonics of all bands below ``order``.
+
+    Args:
+        directions: Unit vectors. Not normalised here; off the sphere the polynomials continue.
+        order: Number of bands, 1 to 128.
+
+    Returns:
+        ``order**2`` values a direction, in the dtype of ``directions``.
+
+    Raises:
+        ValueError: If ``order`` is out of range.
+    """
+    _check_order(order)
+    x, y, z = directions.unbind(-1)
+    functions: list[Tensor] = [z] * (order * order)
+    cosine, sine = torch.ones_like(z), torch.zeros_like(z)
+    diagonal = math.sqrt(1.0 / (4.0 * math.pi))
+    for m in range(order):
+        if m > 0:
+            cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+            diagonal *= math.sqrt((2 * m + 1) / (2 * m))
+        scale = diagonal * (math.sqrt(2.0) if m else 1.0)
+        previous, current = torch.zeros_like(z), torch.full_like(z, scale)
+        for band in range(m, order):
+            functions[sh_index(band, m)] = current * cosine
+            if m > 0:
+                functions[sh_index(band, -m)] = current * sine
+            step, back = _legendre_step(band + 1, m)
+            previous, current = current, step * (z * current - back * previous)
+    return torch.stack(functions, dim=-1)
+
+
+def _legendre_step(band: int, m: int) -> tuple[float, float]:
+    """Factors of P(band) = step * (z P(band-1) - back * P(band-2)), fully normalised."""
+    step = math.sqrt((4.0 * band * band - 1.0) / (band * band - m * m))
+    back = math.sqrt(((band - 1.0) ** 2 - m * m) / (4.0 * (band - 1.0) ** 2 - 1.0))
+    return step, back
+
+
+@functools.lru_cache(maxsize=8)
+def _product_quadrature(order: int) -> tuple[Tensor, Tensor]:
+    """Directions and weights that integrate products of two functions of degree < order exactly."""
+    nodes, node_weights = np.polynomial.legendre.leggauss(order)
+    steps = 2 * order - 1
+    z = torch.from_numpy(nodes)[:, None].expand(order, steps)
+    azimuth = torch.arange(steps, dtype=torch.float64) * (2.0 * math.pi / steps)
+    radius = torch.sqrt((1.0 - z) * (1.0 + z))
+    directions = torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=-1)
+    weights = torch.from_numpy(node_weights)[:, None].expand(order, steps) * (2 * math.pi / steps)
+    return directions.reshape(-1, 3), weights.reshape(-1)
+
+
+def rotation_matrix(
+    rotation: Float[Tensor, "*batch 3 3"], order: int
+) -> Float[Tensor, "*batch coeffs coeffs"]:
+    """Matrices D such that ``D @ c`` are the coefficients of f(R⁻¹ s).
+
+    Exact for any rotation, batched, and differentiable in ``rotation``.
+
+    Args:
+        rotation: Rotation matrices; not checked for orthogonality.
+        order: Number of bands.
+
+    Returns:
+        Block-diagonal orthogonal matrices in the dtype of ``rotation``.
+
+    Raises:
+        ValueError: If ``order`` is out of range.
+    """
+    _check_order(order)
+    directions, weights = (t.to(rotation) for t in _product_quadrature(order))
+    weighted = evaluate(directions, order) * weights[:, None]
+    turned = evaluate(directions @ rotation, order)  # rows are R⁻¹ s
+    matrix = rotation.new_zeros(*rotation.shape[:-2], order * order, order * order)
+    for band in range(order):
+        block = slice(band * band, (band + 1) * (band + 1))
+        matrix[..., block, block] = weighted[:, block].mT @ turned[..., block]
+    return matrix
+
+
+class SphericalHarmonics(LightBasis):
+    """The real spherical harmonics of all bands below ``order`` as a light basis.
+
+    Orthonormal, closed under rotation.
+
+    Args:
+        order: Number of bands; ``order**2`` coefficients.
+    """
+
+    def __init__(self, order: int):
+        _check_order(order)
+        self.order = order
+        self._cube_tables: dict[tuple[int, torch.dtype, torch.device], Tensor] = {}
+
+    @property
+    def num_coeffs(self) -> int:
+        """``order**2``."""
+        return self.order * self.order
+
+    @property
+    def name(self) -> str:
+        """``SH order n``."""
+        return f"SH order {self.order}"
+
+    def project(self, environment: Radiance) -> Float[Tensor, "coeffs rgb"]:
+        """Inner products with each harmonic, float64.
+
+        Source pixels are divided until none is wider than a tenth of the shortest wavelength over
+        2π, which leaves a relative error of at most 1/2400 in the highest band and none in the
+        mean.
+        """
+        total = torch.zeros(self.num_coeffs, 3, dtype=torch.float64)
+        rows = max(1, _TABLE_ELEMENTS // self.num_coeffs)
+        for directions, solid_angles, radiance in environment.sample_blocks(0.1 / self.order):
+            light = radiance.to(torch.float64) * solid_angles[:, None]
+            for some, of_light in zip(directions.split(rows), light.split(rows), strict=True):
+                total = total.to(light.device) + evaluate(some, self.order).mT @ of_light
+        return total
+
+    def project_cube(
+        self, values: Float[Tensor, "points texels"], resolution: int
+    ) -> Float[Tensor, "points coeffs"]:
+        """Quadrature over texel centres, ``values @ y(s)``, summed in float64 by runs of texels."""
+        table = self._cube_table(resolution, values)
+        total = values.new_zeros(values.shape[0], self.num_coeffs, dtype=torch.float64)
+        runs = zip(values.split(_TEXEL_RUN, dim=1), table.split(_TEXEL_RUN), strict=True)
+        for some_values, some_functions in runs:
+            total += some_values @ some_functions
+        return total.to(values.dtype)
+
+    def table_bytes(self, resolution: int) -> int:
+        """One float32 a texel and function."""
+        return 4 * 6 * resolution * resolution * self.num_coeffs
+
+    def _cube_table(self, resolution: int, like: Tensor) -> Float[Tensor, "texels coeffs"]:
+        key = (resolution, like.dtype, like.device)
+        if key not in self._cube_tables:
+            directions = cubemap_directions(resolution, dtype=torch.float64).reshape(-1, 3)
+            rows = max(1, _TABLE_ELEMENTS // self.num_coeffs)
+            pieces = [evaluate(some, self.order).to(like) for some in directions.split(rows)]
+            self._cube_tables = {key: torch.cat(pieces)}
+        return self._cube_tables[key]
+
+    def gram(self) -> Float[Tensor, "coeffs"]:
+        """Ones: the basis is orthonormal."""
+        return torch.ones(self.num_coeffs, dtype=torch.float64)
+
+    def rotate(
+        self, coefficients: Float[Tensor, "*batch coeffs rgb"], rotation: Float[Tensor, "3 3"]
+    ) -> Float[Tensor, "*batch coeffs rgb"]:
+        """Exact rotation by :func:`rotation_matrix`."""
+        return rotation_matrix(rotation.to(coefficients), self.order) @ coefficients
+
+    def describe(self) -> dict[str, Any]:
+        """``{"name": "sh", "order": n}``."""
+        return {"name": "sh", "order": self.order}

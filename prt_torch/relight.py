@@ -1,0 +1,100 @@
+"""Relighting: light in, radiance out, for any representation of transfer.
+
+Batching over lights lives here once. Everything is differentiable: in the light, the views, the
+frames and the parameters of the representation.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from prt_torch.bases import Radiance
+from prt_torch.representations import Representation
+
+
+class Relighter(nn.Module):
+    """Radiance of every point under distant light.
+
+    Args:
+        representation: Any compressed or dense transfer.
+        max_bytes: Largest radiance tensor made in one pass; more lights are taken in turns.
+    """
+
+    def __init__(self, representation: Representation, *, max_bytes: int = 2**30):
+        super().__init__()
+        self.representation = representation
+        self._max_bytes = max_bytes
+
+    def project(self, lights: Radiance | Sequence[Radiance]) -> Float[Tensor, "batch coeffs rgb"]:
+        """Light coefficients of one or several environments.
+
+        Raises:
+            ValueError: If the transfer was given without a light basis.
+        """
+        basis = self.representation.surface.light_basis
+        if basis is None:
+            raise ValueError("this transfer has no light basis; give light coefficients instead")
+        several = lights if isinstance(lights, Sequence) else [lights]
+        like = next(self.representation.parameters())
+        return torch.stack([basis.project(light).to(like) for light in several])
+
+    def forward(
+        self,
+        light: Tensor | Radiance | Sequence[Radiance],
+        views: Float[Tensor, "views 3"] | None = None,
+        frames: Float[Tensor, "points 3 3"] | None = None,
+    ) -> Float[Tensor, "batch views points rgb"]:
+        """Outgoing radiance.
+
+        Args:
+            light: An environment, several, or light coefficients ``"batch coeffs rgb"`` (or
+                ``"batch points coeffs rgb"`` where each point has its own light).
+            views: Where each viewer is, ``"views 3"`` in mesh units, or unit directions towards
+                it ``"views points 3"``. Diffuse transfer skips them: its views dimension has size
+                1, whatever is given here.
+            frames: Shading frames of a deformed surface.
+
+        Returns:
+            Linear RGB radiance, reflectance included.
+
+        Raises:
+            ValueError: If shapes do not fit, or views are needed and not given.
+        """
+        if not isinstance(light, Tensor):
+            light = self.project(light)
+        radiance_bytes = 3 * self.representation.num_points * self.representation.num_rows
+        at_once = max(1, self._max_bytes // (radiance_bytes * light.dtype.itemsize))
+        rows = self._view_rows(views, frames)
+        if len(light) <= at_once:
+            return self._relight(light, rows, frames)
+        return torch.cat([self._relight(some, rows, frames) for some in light.split(at_once)])
+
+    def _relight(self, light: Tensor, rows: Tensor | None, frames: Tensor | None) -> Tensor:
+        radiance = self.representation(light, frames)
+        if rows is None:
+            radiance = radiance[:, None, :, 0]
+        else:
+            radiance = torch.einsum("bprc,vpr->bvpc", radiance, rows)
+        return radiance * self.representation.reflectance
+
+    def _view_rows(
+        self, views: Tensor | None, frames: Tensor | None
+    ) -> Float[Tensor, "views points rows"] | None:
+        """The exit basis at each view; None where radiance does not depend on it."""
+        surface = self.representation.surface
+        if not surface.exit_basis.view_dependent:
+            return None
+        if views is None:
+            raise ValueError("this transfer depends on the view; give views")
+        frames = surface.frames if frames is None else frames
+        if frames is None:
+            raise ValueError("this transfer has no shading frames to take views into")
+        if views.ndim == 2:
+            if surface.positions is None:
+                raise ValueError('this transfer has no positions; give views "views points 3"')
+            views = views[:, None] - surface.positions.to(views)
+            views = torch.nn.functional.normalize(views, dim=-1)
+        local = torch.einsum("pij,vpj->vpi", frames.to(views), views)
+        return surface.exit_basis.evaluate(local)

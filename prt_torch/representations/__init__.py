@@ -1,0 +1,7 @@
+"""Compressed transfer: every representation, the contract they share, and their files."""
+
+from prt_torch.representations.base import Representation
+from prt_torch.representations.cpca import CPCA
+from prt_torch.representations.files import load, save
+
+__all__ = ["CPCA", "Representation", "load", "save"]

@@ -1,0 +1,124 @@
+"""The contract every representation of transfer keeps, and no more.
+
+A representation is set up in closed form by ``from_transfer``, relights by ``forward`` without ever
+forming the dense tensor, shows what it stands for by ``dense``, and lists what a file of it holds
+by ``packed``, which is also what its storage counts. ``tests/contract.py`` holds each to it.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from prt_torch.metric import Metric
+from prt_torch.transfer import Surface, TransferTensor
+
+
+class Representation(nn.Module, ABC):
+    """A compressed transfer tensor.
+
+    Args:
+        surface: Bases, frames and reflectance of the tensor it stands for.
+        shape: Shape of that tensor: points, channels, rows, coeffs.
+    """
+
+    kind: ClassVar[str]
+    """Name in configurations and files."""
+
+    reflectance: Tensor
+
+    def __init__(self, surface: Surface, shape: tuple[int, int, int, int]):
+        super().__init__()
+        self._surface = surface
+        self.num_points, self.num_channels, self.num_rows, self.num_coeffs = shape
+        self.register_buffer("reflectance", surface.reflectance)
+
+    @property
+    def surface(self) -> Surface:
+        """Bases, frames and reflectance, the reflectance where the module is."""
+        return replace(self._surface, reflectance=self.reflectance)
+
+    @classmethod
+    @abstractmethod
+    def from_transfer(
+        cls,
+        transfer: TransferTensor,
+        *,
+        metric: Metric | None = None,
+        generator: torch.Generator | None = None,
+    ) -> "Representation":
+        """The paper's closed-form construction. Subclasses add their budget as keywords.
+
+        Args:
+            transfer: The tensor to stand for.
+            metric: What errors are worth; the L2 norm over light directions if not given.
+            generator: Source of randomness; seed 0 if not given.
+        """
+
+    @abstractmethod
+    def forward(
+        self, light: Float[Tensor, "batch coeffs rgb"], frames: Tensor | None = None
+    ) -> Float[Tensor, "batch points rows rgb"]:
+        """Radiance in the exit basis, before reflectance, for a batch of lights.
+
+        Args:
+            light: Light coefficients ``"batch coeffs rgb"``, or ``"batch points coeffs rgb"``
+                where each point has its own light.
+            frames: Poses of a deformed surface, ``"points 3 3"``.
+
+        Raises:
+            ValueError: If shapes do not fit, or the representation cannot be posed.
+        """
+
+    @abstractmethod
+    def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
+        """The tensor it stands for; only some points if their indices are given."""
+
+    @abstractmethod
+    def packed(self) -> dict[str, Tensor]:
+        """What a file holds: everything needed to relight, reflectance aside."""
+
+    @classmethod
+    @abstractmethod
+    def from_packed(
+        cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
+    ) -> "Representation":
+        """The inverse of :meth:`packed`, to the bit."""
+
+    @property
+    @abstractmethod
+    def budget(self) -> dict[str, Any]:
+        """What it was given to spend, such as ``{"num_clusters": 128, "rank": 4}``."""
+
+    @property
+    @abstractmethod
+    def condition(self) -> float:
+        """Condition number of the worst solve of its construction; 1 where there was none."""
+
+    def storage(self) -> dict[str, int]:
+        """Bytes of each part of a file of it, reflectance included."""
+        parts = {name: tensor.nbytes for name, tensor in self.packed().items()}
+        return {**parts, "reflectance": self.reflectance.nbytes}
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Shape of the tensor it stands for."""
+        return self.num_points, self.num_channels, self.num_rows, self.num_coeffs
+
+    def _check_light(self, light: Tensor) -> bool:
+        """Whether each point has its own light.
+
+        Raises:
+            ValueError: If the shape does not fit.
+        """
+        local = light.ndim == 4
+        expected = (self.num_points, self.num_coeffs, 3) if local else (self.num_coeffs, 3)
+        if light.ndim not in (3, 4) or tuple(light.shape[1:]) != expected:
+            raise ValueError(
+                f'expected light "batch {self.num_coeffs} 3" or '
+                f'"batch {self.num_points} {self.num_coeffs} 3", got {tuple(light.shape)}'
+            )
+        return local

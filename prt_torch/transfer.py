@@ -1,0 +1,178 @@
+"""The transfer tensor: for every point, the linear map from distant light to outgoing radiance.
+
+Everything upstream (meshes, rays, materials) ends in a :class:`TransferTensor`; everything
+downstream (representations, relighting, reports) begins with one. It need not have come from a
+mesh: :meth:`TransferTensor.from_dense` takes any array.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from prt_torch.bases import Diffuse, ExitBasis, LightBasis, Rowwise
+
+
+class Rows(Protocol):
+    """Values read by slices of points: a tensor in memory, or shards on disk."""
+
+    @property
+    def shape(self) -> Any:
+        """Shape of the whole."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of the elements."""
+        ...
+
+    def __getitem__(self, rows: slice, /) -> Tensor:
+        """The points ``start:stop``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is known of the points and the two bases; shared by a tensor and what is fitted to it.
+
+    Attributes:
+        exit_basis: What the rows mean.
+        light_basis: What the coefficients mean; None for a tensor given without one, which then
+            can be relit by coefficients only.
+        reflectance: ``"points rgb"``, or ``"1 rgb"`` where all points share it. Multiplies the
+            radiance at the end.
+        frames: ``"points 3 3"`` shading frames, rows tangent, bitangent, normal; None where views
+            do not matter.
+        positions: ``"points 3"`` in mesh units; None for a tensor that never was a mesh.
+    """
+
+    exit_basis: ExitBasis = field(default_factory=Diffuse)
+    light_basis: LightBasis | None = None
+    reflectance: Float[Tensor, "points rgb"] = field(default_factory=lambda: torch.ones(1, 3))
+    frames: Float[Tensor, "points 3 3"] | None = None
+    positions: Float[Tensor, "points 3"] | None = None
+
+
+@dataclass(frozen=True)
+class TransferTensor:
+    """Values ``"points channels rows coeffs"`` with what is needed to understand them.
+
+    Acts on world-frame light, in the rest pose. Make one with :func:`prt_torch.bake` or
+    :meth:`from_dense`.
+
+    Attributes:
+        values: A tensor, or anything that gives blocks of points on slicing.
+        surface: Bases, frames, reflectance.
+        reference_squared_norm: ``"points"``: squared L2 norm over the sphere of the transfer
+            function at the full resolution it was baked at, before projection into the light
+            basis; None when not known. Allows errors that compare across bases.
+        provenance: Hashes of the inputs, seed, versions, timings.
+    """
+
+    values: Rows
+    surface: Surface = field(default_factory=Surface)
+    reference_squared_norm: Float[Tensor, "points"] | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.values.shape) != 4:
+            raise ValueError(
+                'expected values "points channels rows coeffs" (from_dense adds missing '
+                f"dimensions), got shape {tuple(self.values.shape)}"
+            )
+        rows, coeffs = self.surface.exit_basis.num_rows, self.num_coeffs
+        if self.num_rows != rows:
+            raise ValueError(f"expected {rows} rows for the exit basis, got {self.num_rows}")
+        basis = self.surface.light_basis
+        if basis is not None and basis.num_coeffs != coeffs:
+            raise ValueError(f"expected {basis.num_coeffs} coeffs for {basis.name}, got {coeffs}")
+        if len(self.surface.reflectance) not in (1, self.num_points):
+            raise ValueError(
+                f"expected reflectance of 1 or {self.num_points} points, "
+                f"got {len(self.surface.reflectance)}"
+            )
+
+    @classmethod
+    def from_dense(
+        cls, values: Tensor, *, light_basis: LightBasis | None = None, **surface: Any
+    ) -> "TransferTensor":
+        """A tensor from any array, without a mesh.
+
+        Args:
+            values: ``"points coeffs"``, ``"points rows coeffs"`` or
+                ``"points channels rows coeffs"``. Several rows without an ``exit_basis`` have no
+                view functions (:class:`prt_torch.bases.Rowwise`).
+            light_basis: What the coefficients mean, if they mean anything.
+            surface: Further fields of :class:`Surface`.
+
+        Raises:
+            ValueError: If the shape is none of these, or a value is NaN or infinite.
+        """
+        if not 2 <= values.ndim <= 4:
+            raise ValueError(f"expected 2, 3 or 4 dimensions, got shape {tuple(values.shape)}")
+        if not torch.isfinite(values).all():
+            bad = int((~torch.isfinite(values)).sum())
+            raise ValueError(f"transfer values: {bad} are NaN or infinite")
+        values = values.detach()
+        while values.ndim < 4:
+            values = values.unsqueeze(1)
+        if "exit_basis" not in surface and values.shape[2] > 1:
+            surface["exit_basis"] = Rowwise(values.shape[2])
+        return cls(values, Surface(light_basis=light_basis, **surface))
+
+    @property
+    def num_points(self) -> int:
+        """Surface points."""
+        return self.values.shape[0]
+
+    @property
+    def num_channels(self) -> int:
+        """1 where colour factors out, else 3."""
+        return self.values.shape[1]
+
+    @property
+    def num_rows(self) -> int:
+        """Functions of the exit basis."""
+        return self.values.shape[2]
+
+    @property
+    def num_coeffs(self) -> int:
+        """Functions of the light basis."""
+        return self.values.shape[3]
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes to relight from the uncompressed tensor: values and reflectance."""
+        count = self.num_points * self.num_channels * self.num_rows * self.num_coeffs
+        reflectance = self.surface.reflectance
+        return count * self.values.dtype.itemsize + reflectance.nbytes
+
+    def dense(self) -> Float[Tensor, "points channels rows coeffs"]:
+        """The whole tensor in memory."""
+        return self.values[0 : self.num_points]
+
+    def blocks(self, max_bytes: int = 2**28) -> Iterator[tuple[slice, Tensor]]:
+        """Blocks of points of at most ``max_bytes`` (one point at least), in order."""
+        point_bytes = (
+            self.num_channels * self.num_rows * self.num_coeffs * self.values.dtype.itemsize
+        )
+        step = max(1, max_bytes // point_bytes)
+        for start in range(0, self.num_points, step):
+            rows = slice(start, min(start + step, self.num_points))
+            yield rows, self.values[rows]
+
+    def squared_norm(self) -> Float[Tensor, "points"]:
+        """Squared L2 norm of each point's transfer over the sphere, summed over rows, float64."""
+        return torch.cat([self.squared_norm_of(values) for _, values in self.blocks()])
+
+    def squared_norm_of(
+        self, values: Float[Tensor, "points channels rows coeffs"]
+    ) -> Float[Tensor, "points"]:
+        """Squared norm in this tensor's light basis of other values, such as a difference."""
+        basis = self.surface.light_basis
+        if basis is None:
+            return values.to(torch.float64).square().sum((1, 2, 3))
+        return basis.squared_norm(values).sum((1, 2))
