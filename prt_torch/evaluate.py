@@ -37,19 +37,40 @@ def transfer_error(representation: Representation, transfer: TransferTensor) -> 
     return float(squared_errors(representation, transfer).sum()) / norm if norm > 0 else 0.0
 
 
-def reference_error(representation: Representation, transfer: TransferTensor) -> float | None:
+def reference_error(squared_error: float, transfer: TransferTensor) -> float | None:
     """Squared error over squared norm of transfer at the full resolution it was baked at.
 
     What the light basis cut off counts too, so it compares across bases. The values are the
     orthogonal projection of the full transfer, so its squared error is what the projection lost
     plus what the representation loses. None where the full norm is not known.
+
+    Args:
+        squared_error: Sum of :func:`squared_errors` of a representation; 0 for the tensor itself.
+        transfer: What it stands for.
     """
     if transfer.reference_squared_norm is None:
         return None
     full = float(transfer.reference_squared_norm.sum())
     lost = full - float(transfer.squared_norm().sum())
-    error = max(lost, 0.0) + float(squared_errors(representation, transfer).sum())
-    return error / full if full > 0 else 0.0
+    return (max(lost, 0.0) + squared_error) / full if full > 0 else 0.0
+
+
+def dense_radiance(
+    transfer: TransferTensor, light: Float[Tensor, "batch coeffs rgb"]
+) -> Float[Tensor, "batch points rgb"]:
+    """Radiance of a diffuse tensor itself, reflectance included, read by blocks of points.
+
+    Raises:
+        ValueError: If the tensor has several rows, which need views.
+    """
+    if transfer.num_rows != 1:
+        raise ValueError(f"expected diffuse transfer, got {transfer.num_rows} rows")
+    equation = "pci,bic->bpc" if transfer.num_channels == 3 else "pzi,bic->bpc"
+    pieces = [
+        torch.einsum(equation, values[:, :, 0], light.to(values))
+        for _, values in transfer.blocks(_BLOCK_BYTES)
+    ]
+    return torch.cat(pieces, dim=1) * transfer.surface.reflectance.to(light)
 
 
 def radiance_error(

@@ -162,10 +162,13 @@ def locked(folder: Path, *, what: str = "folder", wait: bool = False) -> Iterato
         what: What to call it in an error.
         wait: Wait for another holder instead of raising.
 
+    A folder made here in which nothing was written is removed again.
+
     Raises:
         InputError: If another process holds the folder, or it cannot be made or written.
     """
     folder = Path(folder)
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
@@ -182,6 +185,9 @@ def locked(folder: Path, *, what: str = "folder", wait: bool = False) -> Iterato
             stray.unlink(missing_ok=True)
         yield folder
     finally:
+        if made:
+            with suppress(OSError):  # not empty: something was written and stays
+                folder.rmdir()
         os.close(descriptor)
 
 

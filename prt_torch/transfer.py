@@ -154,6 +154,21 @@ class TransferTensor:
         """The whole tensor in memory."""
         return self.values[0 : self.num_points]
 
+    def block(self, rows: slice) -> "TransferTensor":
+        """Some of the points as a tensor of their own, in memory."""
+        surface = self.surface
+        shared = len(surface.reflectance) == 1
+        return TransferTensor(
+            self.values[rows],
+            Surface(
+                exit_basis=surface.exit_basis,
+                light_basis=surface.light_basis,
+                reflectance=surface.reflectance if shared else surface.reflectance[rows],
+                frames=None if surface.frames is None else surface.frames[rows],
+                positions=None if surface.positions is None else surface.positions[rows],
+            ),
+        )
+
     def blocks(self, max_bytes: int = 2**28) -> Iterator[tuple[slice, Tensor]]:
         """Blocks of points of at most ``max_bytes`` (one point at least), in order."""
         point_bytes = (

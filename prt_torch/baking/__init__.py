@@ -3,12 +3,19 @@
 from pathlib import Path
 
 from prt_torch.assets.mesh import Mesh
-from prt_torch.baking.direct import project_diffuse
+from prt_torch.baking.direct import check_memory, project_diffuse
 from prt_torch.baking.visibility import Progress, VisibilityField, trace_visibility
 from prt_torch.bases import LightBasis, SphericalHarmonics
 from prt_torch.transfer import TransferTensor
 
-__all__ = ["Progress", "VisibilityField", "bake", "project_diffuse", "trace_visibility"]
+__all__ = [
+    "Progress",
+    "VisibilityField",
+    "bake",
+    "check_memory",
+    "project_diffuse",
+    "trace_visibility",
+]
 
 
 def bake(

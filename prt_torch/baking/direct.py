@@ -19,6 +19,7 @@ from prt_torch import store
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.visibility import Progress, VisibilityField
 from prt_torch.bases import Diffuse, LightBasis
+from prt_torch.errors import InputError
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles, frame_from_normal
 from prt_torch.transfer import Surface, TransferTensor
 
@@ -51,21 +52,14 @@ def project_diffuse(
 
     Raises:
         ValueError: If mesh and visibility do not belong together.
-        InputError: If the cache cannot be written or is damaged.
+        InputError: If the memory budget is too small, or the cache cannot be written or is damaged.
     """
     if visibility.bits.shape[0] != mesh.num_points:
         raise ValueError(
             f"expected visibility of {mesh.num_points} points, got {visibility.bits.shape[0]}"
         )
     resolution = visibility.resolution
-    table_bytes = light_basis.table_bytes(resolution)
-    per_point = _BYTES_PER_TEXEL * 6 * resolution * resolution
-    at_once = min((memory_budget - table_bytes) // per_point, _POINTS_AT_ONCE)
-    if at_once < 1:
-        raise ValueError(
-            f"memory budget of {memory_budget} bytes holds not one point: "
-            f"expected at least {table_bytes + per_point}"
-        )
+    at_once = check_memory(light_basis, resolution, memory_budget)
     solid_angles = cubemap_solid_angles(resolution, dtype=torch.float64).reshape(-1)
     directions = cubemap_directions(resolution, dtype=torch.float64).reshape(-1, 3)
     weighted_directions = (directions * (solid_angles / math.pi)[:, None]).mT.float().contiguous()
@@ -120,6 +114,27 @@ def project_diffuse(
     return TransferTensor(
         built.tensors["values"], surface, squared_norm[0 : mesh.num_points], provenance
     )
+
+
+def check_memory(light_basis: LightBasis, resolution: int, memory_budget: int) -> int:
+    """How many points can be projected at once within a memory budget.
+
+    Args:
+        light_basis: What to project into.
+        resolution: Sub-texels along an edge of a face of the visibility cube.
+        memory_budget: Bytes.
+
+    Raises:
+        InputError: If not even one.
+    """
+    table_bytes = light_basis.table_bytes(resolution)
+    per_point = _BYTES_PER_TEXEL * 6 * resolution * resolution
+    if table_bytes + per_point > memory_budget:
+        raise InputError(
+            f"memory_budget: {light_basis.name} at {resolution} texels an edge needs at least "
+            f"{table_bytes + per_point} bytes, got {memory_budget}"
+        )
+    return min((memory_budget - table_bytes) // per_point, _POINTS_AT_ONCE)
 
 
 def shared_reflectance(albedo: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca import CPCA
+from prt_torch.representations.dense import DenseTransfer
 from prt_torch.representations.files import load, save
 
-__all__ = ["CPCA", "Representation", "load", "save"]
+__all__ = ["CPCA", "DenseTransfer", "Representation", "load", "save"]

@@ -44,7 +44,7 @@ _TURNS_PER_RANK = 8
 _LAST_TURNS = 24
 _FEW_LLOYD_MOVES = 5e-4  # share of points; below it Lloyd's iterations end
 _FEW_MOVES = 2e-3  # share of points; below it a turn ends a rank
-_STIFF = 1e6  # ratio of singular values above which Gram matrices are not trusted
+_STIFF = 1e3  # ratio of singular values above which Gram matrices are not trusted
 _BLOCK_ELEMENTS = 2**24  # of one table of distances
 
 
@@ -334,13 +334,18 @@ def _decompose(
     for rows in blocks.by_bucket(centred):
         singular, directions = _principal(rows, rank)
         vectors.append(directions)
-        kept = singular > 0
-        smallest = torch.where(kept, singular, torch.inf).amin(1, keepdim=True)
-        ratio = torch.where(kept, singular / smallest, 1.0)
-        condition = max(condition, float(ratio.max())) if ratio.numel() else condition
+        condition = max(condition, _worst_ratio(singular))
     joined = torch.cat(vectors)
     weights = blocks.to_points(blocks.matmul(centred, joined.mT))
     return means, joined, weights, condition
+
+
+def _worst_ratio(singular: Float[Tensor, "clusters rank"]) -> float:
+    """Largest over smallest nonzero singular value, of the worst cluster."""
+    if singular.shape[1] == 0:
+        return 1.0
+    smallest = torch.where(singular > 0, singular, torch.inf).amin(1)
+    return float((singular[:, 0] / smallest).max().clamp_min(1.0))
 
 
 def _principal(

@@ -12,9 +12,10 @@ from prt_torch.bases import exit_basis, light_basis
 from prt_torch.errors import InputError
 from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca import CPCA
+from prt_torch.representations.dense import DenseTransfer
 from prt_torch.transfer import Surface
 
-KINDS: dict[str, type[Representation]] = {CPCA.kind: CPCA}
+KINDS: dict[str, type[Representation]] = {kind.kind: kind for kind in (CPCA, DenseTransfer)}
 """The closed registry of representations: name in configurations and files, to class."""
 
 

@@ -7,6 +7,7 @@ gather, which drops the padding and undoes the sorting at once.
 """
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import torch
@@ -110,8 +111,10 @@ class ClusterBlocks(nn.Module):
 
     def by_bucket(self, values: Float[Tensor, "slots *rest a"]) -> list[Tensor]:
         """Views ``"clusters rows a"``, one a bucket; rows are slots times ``rest``."""
-        width = values.shape[-1]
-        return [values[b.slots].reshape(b.num_clusters, -1, width) for b in self.buckets]
+        per_slot, width = math.prod(values.shape[1:-1]), values.shape[-1]
+        return [
+            values[b.slots].reshape(b.num_clusters, b.size * per_slot, width) for b in self.buckets
+        ]
 
     def matmul(
         self,

@@ -1,0 +1,43 @@
+"""Gather the reports of several runs into one page and one table.
+
+python eval/report.py RUN... [--out=FOLDER]
+"""
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from prt_torch import store
+from prt_torch.command import main
+from prt_torch.errors import InputError
+from prt_torch.report import gather, summary_table, write_html
+
+USAGE = "usage: python eval/report.py RUN... [--out=FOLDER]   (default FOLDER: runs/report)"
+
+
+@main
+def report(arguments: list[str]) -> None:
+    """Write ``report.json`` and ``report.html`` of all runs side by side."""
+    if not arguments or "-h" in arguments or "--help" in arguments:
+        print(USAGE)
+        return
+    out, runs = Path("runs/report"), []
+    for argument in arguments:
+        if argument.startswith("--out="):
+            out = Path(argument.partition("=")[2])
+        elif argument.startswith("-"):
+            raise InputError(f"{argument}: unknown option; {USAGE}")
+        else:
+            runs.append(Path(argument))
+    gathered = gather([store.read_json(run / "report.json") for run in runs])
+    with store.locked(out, what="output folder"):
+        store.write_json(out / "report.json", gathered)
+        write_html(out / "report.html", gathered, [])
+    console = Console()
+    console.print(summary_table(gathered))
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    sys.exit(report(sys.argv[1:]))

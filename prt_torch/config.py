@@ -1,0 +1,275 @@
+"""A run's configuration: composed by Hydra, validated by pydantic.
+
+Hydra puts ``configs/`` and the overrides of the command line together; the models here say what
+every key means, its type and its range. Whatever is wrong becomes one line that names the key and
+the choices.
+"""
+
+import itertools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from prt_torch.errors import InputError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Albedo = tuple[
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+]
+
+
+class SceneConfig(_Section):
+    """What is lit."""
+
+    mesh: str | None = Field(None, description="mesh file; null is the embedded procedural scene")
+    ground: bool = Field(True, description="put a mesh file on a ground plane")
+    ground_size: float = Field(4.0, gt=0, description="its edge, in horizontal extents of the mesh")
+    ground_resolution: int = Field(48, ge=2, description="points along its edge")
+    up: Literal["y", "z"] = Field("y", description="up axis of the mesh file")
+    orientation: Literal["file", "flip", "outward"] = Field("file", description="facing of faces")
+    albedo: Albedo | None = Field(None, description="linear RGB, in place of the file's colours")
+    transform: list[list[float]] | None = Field(None, description="4x4, applied after up")
+
+
+class LightConfig(_Section):
+    """Distant light: names of embedded lights, or files."""
+
+    fit: list[str] = Field(default_factory=list, description="lights that a light prior expects")
+    test: list[str] = Field(..., min_length=1, description="held-out lights that errors are for")
+    layout: Literal["auto", "latlong", "vertical_cross", "horizontal_cross"] = "auto"
+    rotation_degrees: float = Field(0.0, description="turns every light about +y")
+    exposure: float = Field(0.0, ge=-100, le=100, description="stops")
+
+
+class TransferConfig(_Section):
+    """What is baked."""
+
+    light_basis: Literal["sh", "cube"] = "sh"
+    order: int = Field(6, ge=1, le=64, description="bands of spherical harmonics")
+    resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
+    supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
+
+
+class CPCAConfig(_Section):
+    """Sloan et al. 2003."""
+
+    name: Literal["cpca"] = "cpca"
+    num_clusters: int = Field(128, ge=1)
+    rank: int = Field(4, ge=1)
+    method: Literal["iterative", "static"] = "iterative"
+
+
+RepresentationConfig = CPCAConfig
+"""The closed registry of representations that a run can fit, told apart by ``name``."""
+
+
+class FitConfig(_Section):
+    """Refinement by gradients after the closed form."""
+
+    optimizer: Literal["lbfgs", "adam"] = "lbfgs"
+    max_steps: int = Field(10, ge=0, description="0 keeps the closed form")
+    metric: Literal["l2", "light_prior"] = Field("l2", description="what errors are worth")
+
+
+class PreviewConfig(_Section):
+    """Pictures."""
+
+    width: int = Field(480, ge=16, le=8192)
+    height: int = Field(360, ge=16, le=8192)
+    opengl: bool = Field(True, description="also draw with pyrender where EGL exists")
+
+
+class RunConfig(_Section):
+    """One complete run."""
+
+    scene: SceneConfig
+    light: LightConfig
+    transfer: TransferConfig
+    representation: RepresentationConfig = Field(..., description="the one to fit")
+    representations: list[RepresentationConfig] = Field(
+        default_factory=list, description="several to fit; wins over representation"
+    )
+    fit: FitConfig
+    preview: PreviewConfig
+    out: str | None = Field(None, description="run folder; null is runs/SCENE-HASH")
+    cache: str = Field(..., min_length=1, description="folder of bakes")
+    memory_budget: int = Field(4 * 2**30, ge=2**24, description="bytes a computation may take")
+    seed: int = Field(0, ge=0, lt=2**63)
+
+    @property
+    def fitted(self) -> list[RepresentationConfig]:
+        """The representations that this run fits."""
+        return self.representations or [self.representation]
+
+
+USAGE = """\
+usage: python {script} [--config-name NAME] [-m] [KEY=VALUE ...]
+
+  KEY=VALUE            override a key: scene.mesh=bunny.obj representation.rank=8
+  -m                   run a grid: representation.rank=4,8,16
+  --config-name NAME   start from configs/NAME.yaml (default fit)
+
+keys of configs/{name}.yaml and its groups:
+"""
+
+
+def parse_command_line(
+    arguments: list[str], config_dir: Path, *, default_name: str, script: str
+) -> Iterator[RunConfig]:
+    """Runs that a command line asks for: one, or the points of a grid with ``-m``.
+
+    All of them are validated before the first is returned.
+
+    Raises:
+        InputError: If a key, type, value or choice is wrong.
+        SystemExit: With status 0, after ``--help``.
+    """
+    name, overrides, grid = default_name, [], False
+    rest = iter(arguments)
+    for argument in rest:
+        match argument:
+            case "-m" | "--multirun":
+                grid = True
+            case "-h" | "--help":
+                plain = _compose(config_dir, name, [])
+                print(USAGE.format(script=script, name=name) + OmegaConf.to_yaml(plain), end="")
+                raise SystemExit(0)
+            case "--config-name":
+                name = next(rest, "")
+            case _ if argument.startswith("--config-name="):
+                name = argument.partition("=")[2]
+            case _ if argument.startswith("-"):
+                raise InputError(f"{argument}: unknown option; see --help")
+            case _:
+                overrides.append(argument)
+    points = _grid_points(overrides) if grid else [overrides]
+    return iter([load_config(config_dir, name, point) for point in points])
+
+
+def load_config(config_dir: Path, name: str, overrides: list[str]) -> RunConfig:
+    """Compose and validate one run.
+
+    Raises:
+        InputError: If a key, type, value or choice is wrong.
+    """
+    composed = _compose(config_dir, name, overrides)
+    try:
+        content = OmegaConf.to_container(composed, resolve=True)
+    except OmegaConfBaseException as error:
+        raise InputError(f"configuration: {_first_line(error)}") from error
+    if isinstance(content, dict):
+        named = content.get("representations") or []
+        content["representations"] = [_by_name(config_dir, entry) for entry in named]
+    try:
+        return RunConfig.model_validate(content)
+    except ValidationError as error:
+        raise InputError(_describe(error)) from error
+
+
+def _compose(config_dir: Path, name: str, overrides: list[str]) -> Any:
+    if not (config_dir / f"{name}.yaml").is_file():
+        choices = ", ".join(sorted(path.stem for path in config_dir.glob("*.yaml")))
+        raise InputError(f"--config-name={name}: no such configuration; expected one of {choices}")
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(config_dir.resolve()), version_base="1.3"):
+            # Unknown keys go through, for the validation to name them beside the known ones.
+            return compose(name, overrides=[_forced(override) for override in overrides])
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        raise InputError(f"configuration: {_explain(error)}") from error
+
+
+def _forced(override: str) -> str:
+    """``a.b=1`` as ``++a.b=1``: set whether or not the key is there; groups are left alone."""
+    key = override.partition("=")[0]
+    return f"++{override}" if "." in key or key in _TOP_LEVEL_VALUES else override
+
+
+_TOP_LEVEL_VALUES = tuple(
+    name
+    for name in RunConfig.model_fields
+    if name not in ("scene", "light", "transfer", "representation", "fit", "preview")
+)
+
+
+def _grid_points(overrides: list[str]) -> list[list[str]]:
+    """The product of all overrides that list several values."""
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        choices = [
+            [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
+            if one.is_sweep_override()
+            else [one.input_line or ""]
+            for one in parsed
+        ]
+    except HydraException as error:
+        raise InputError(f"configuration: {_explain(error)}") from error
+    return [list(point) for point in itertools.product(*choices)]
+
+
+def _by_name(config_dir: Path, entry: Any) -> Any:
+    """A representation given by its name alone takes the defaults of its group file."""
+    if not isinstance(entry, str):
+        return entry
+    file = config_dir / "representation" / f"{entry}.yaml"
+    if not file.is_file():
+        choices = ", ".join(sorted(path.stem for path in file.parent.glob("*.yaml")))
+        raise InputError(f"representations: unknown {entry!r}; expected one of {choices}")
+    return OmegaConf.to_container(OmegaConf.load(file), resolve=True)
+
+
+def _explain(error: Exception) -> str:
+    """Hydra's message in one line, with the choices of a group if it lists them."""
+    text = str(error)
+    missing = re.search(r"Could not find '([^/]+)/(.*)'", text)
+    if missing:
+        options = re.findall(r"^\t(\w+)$", text.partition("Available options")[2], re.MULTILINE)
+        choices = ", ".join(options)
+        return f"{missing[1]}: unknown {missing[2]!r}; expected one of {choices}"
+    override = re.search(r"Could not override '([^']+)'", text)
+    if override:
+        return f"{override[1]}: unknown key; expected one of {', '.join(RunConfig.model_fields)}"
+    return _first_line(error)
+
+
+def _first_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), repr(error))
+
+
+def _describe(error: ValidationError) -> str:
+    """The first problem in one line: key, what was expected, what was given."""
+    problem = error.errors()[0]
+    key = ".".join(str(part) for part in problem["loc"])
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if problem["type"] == "extra_forbidden":
+        *section, _ = problem["loc"]
+        return f"{key}: unknown key; expected one of {', '.join(_keys_of(section))}{more}"
+    message = problem["msg"][:1].lower() + problem["msg"][1:]
+    given = repr(problem["input"])
+    return f"{key}: {message}, got {given if len(given) < 80 else given[:77] + '...'}{more}"
+
+
+def _keys_of(section: list[Any]) -> list[str]:
+    """The keys that a section of the configuration has."""
+    model: Any = RunConfig
+    for part in section:
+        if isinstance(part, str) and part in model.model_fields:
+            model = model.model_fields[part].annotation
+            if not hasattr(model, "model_fields"):  # a list of sections
+                model = model.__args__[0]
+    return list(model.model_fields)

@@ -1,0 +1,297 @@
+"""One run from its configuration to its folder: bake, fit, evaluate, draw, report.
+
+The folder holds ``config.yaml`` (resolved), ``results/`` (fitted modules), ``pictures/``,
+``report.html``, ``report.json`` and, written last, ``manifest.json`` with the size and SHA-256 of
+each. A run that was killed goes on where it stopped when it is started again.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from prt_torch import store
+from prt_torch.account import Fitted, Inputs, write_report
+from prt_torch.assets import (
+    Environment,
+    Mesh,
+    concatenate,
+    find_environment,
+    ground_plane,
+    load_mesh,
+    procedural_scene,
+)
+from prt_torch.baking import check_memory, project_diffuse, trace_visibility
+from prt_torch.bases import CubeDirections, LightBasis, SphericalHarmonics
+from prt_torch.config import RepresentationConfig, RunConfig
+from prt_torch.errors import InputError
+from prt_torch.fitting import fit
+from prt_torch.gallery import file_name
+from prt_torch.metric import Metric
+from prt_torch.report import summary_table
+from prt_torch.representations import CPCA, load, save
+from prt_torch.transfer import TransferTensor
+
+
+def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]:
+    """Do a whole run and return its report.
+
+    Args:
+        config: What to do.
+        console: Where to tell of it; standard error if not given.
+
+    Raises:
+        InputError: If an input is unusable, or the run folder is in use, belongs to another run or
+            cannot be written.
+    """
+    console = console or Console(stderr=True)
+    inputs = _load(config)
+    _warn(inputs.mesh, console)
+    out = run_folder(config)
+    with store.locked(out, what="output folder"):
+        _claim(out, config)
+        transfer = _bake(config, inputs, console)
+        fitted = _fit_all(out, config, inputs, transfer, console)
+        console.print("evaluating and drawing ...")
+        report = write_report(
+            out,
+            inputs,
+            transfer,
+            fitted,
+            preview=config.preview,
+            memory_budget=config.memory_budget,
+        )
+        _write_manifest(out, transfer)
+    console.print(summary_table(report))
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+    return report
+
+
+def bake_only(config: RunConfig, console: Console | None = None) -> TransferTensor:
+    """Bake what a run needs, into the cache, and say what it took.
+
+    Raises:
+        InputError: If an input is unusable or the cache cannot be written.
+    """
+    console = console or Console(stderr=True)
+    inputs = _load(config)
+    _warn(inputs.mesh, console)
+    transfer = _bake(config, inputs, console)
+    made = transfer.provenance
+    rate = made["rays"] / made["visibility_seconds"] / 1e6 if made["visibility_seconds"] else 0.0
+    console.print(
+        f"{transfer.num_points} points, {inputs.light_basis.name}, "
+        f"{transfer.num_bytes / 2**20:.1f} MiB; {made['rays'] / 1e6:.1f} M rays at {rate:.1f} M/s"
+        f"{' (cached)' if made['visibility_cached'] else ''}, projected in "
+        f"{made['projection_seconds']:.1f} s{' (cached)' if made['projection_cached'] else ''}",
+        soft_wrap=True,
+    )
+    return transfer
+
+
+def _warn(mesh: Mesh, console: Console) -> None:
+    for warning in mesh.warnings:
+        console.print(f"warning: {warning.name}: {warning.message}", style="yellow", soft_wrap=True)
+
+
+def run_folder(config: RunConfig) -> Path:
+    """Where a run's files go: as configured, else ``runs/SCENE-HASH``."""
+    if config.out is not None:
+        return Path(config.out)
+    scene = Path(config.scene.mesh).stem if config.scene.mesh else "procedural"
+    return Path("runs") / f"{file_name(scene)}-{store.digest(_identity(config))[:8]}"
+
+
+def _identity(config: RunConfig) -> dict[str, Any]:
+    """What the results of a run follow from."""
+    return config.model_dump(mode="json", exclude={"out", "cache", "memory_budget"})
+
+
+def _load(config: RunConfig) -> Inputs:
+    scene, light = config.scene, config.light
+    if scene.mesh is None:
+        mesh = procedural_scene()
+    else:
+        mesh = load_mesh(
+            scene.mesh,
+            up=scene.up,
+            transform=scene.transform,
+            orientation=scene.orientation,
+            albedo=scene.albedo,
+        )
+        if scene.ground:
+            ground = ground_plane(mesh, size=scene.ground_size, resolution=scene.ground_resolution)
+            mesh = concatenate([mesh, ground], mesh.name)
+
+    def find(names: list[str]) -> list[Environment]:
+        return [
+            find_environment(
+                name,
+                layout=light.layout,
+                rotation_degrees=light.rotation_degrees,
+                exposure=light.exposure,
+            )
+            for name in names
+        ]
+
+    inputs = Inputs(mesh, find(light.fit), find(light.test), _light_basis(config))
+    if config.fit.metric == "light_prior" and not inputs.fit_lights:
+        raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
+    names = [environment.name for environment in inputs.test_lights]
+    if len(set(names)) != len(names):
+        raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
+    fine = config.transfer.resolution * config.transfer.supersampling
+    check_memory(inputs.light_basis, fine, config.memory_budget)
+    return inputs
+
+
+def _light_basis(config: RunConfig) -> LightBasis:
+    match config.transfer.light_basis:
+        case "sh":
+            return SphericalHarmonics(config.transfer.order)
+        case "cube":
+            return CubeDirections(config.transfer.resolution)
+
+
+def _claim(out: Path, config: RunConfig) -> None:
+    """Write the configuration, or make sure that the folder holds the same one."""
+    path = out / "config.yaml"
+    text = OmegaConf.to_yaml(OmegaConf.create(_identity(config)))
+    if not path.exists():
+        store.write_bytes(path, text.encode())
+    elif path.read_text() != text:
+        raise InputError(f"{out}: output folder holds another run; choose another or remove it")
+
+
+def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor:
+    cache = Path(config.cache)
+    with _progress(console) as progress:
+
+        def tell(what: str):
+            task = progress.add_task(what, total=inputs.mesh.num_points)
+            return lambda done, total: progress.update(task, completed=done, total=total)
+
+        visibility = trace_visibility(
+            inputs.mesh,
+            resolution=config.transfer.resolution,
+            supersampling=config.transfer.supersampling,
+            cache=cache,
+            progress=tell("trace visibility"),
+        )
+        return project_diffuse(
+            inputs.mesh,
+            visibility,
+            inputs.light_basis,
+            cache=cache,
+            memory_budget=config.memory_budget,
+            progress=tell("project transfer"),
+        )
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _fit_all(
+    out: Path, config: RunConfig, inputs: Inputs, transfer: TransferTensor, console: Console
+) -> list[Fitted]:
+    metric = Metric.l2(transfer)
+    if config.fit.metric == "light_prior":
+        lights = torch.stack([inputs.light_basis.project(light) for light in inputs.fit_lights])
+        metric = Metric.light_prior(lights, inputs.light_basis)
+    fitted, names = [], set()
+    with _progress(console) as progress:
+        for wanted in config.fitted:
+            name = _name(wanted)
+            if name in names:
+                raise InputError(f"representations: {name} is asked for twice")
+            names.add(name)
+            task = progress.add_task(f"fit {name}", total=config.fit.max_steps or 1)
+            fitted.append(
+                _fit_one(
+                    out / "results" / f"{file_name(name)}.safetensors",
+                    name,
+                    wanted,
+                    config,
+                    transfer,
+                    metric,
+                    lambda done, total, task=task: progress.update(task, completed=done),
+                )
+            )
+            progress.update(task, completed=config.fit.max_steps or 1)
+    return fitted
+
+
+def _name(wanted: RepresentationConfig) -> str:
+    method = "" if wanted.method == "iterative" else f" {wanted.method}"
+    return f"{wanted.name}{method} {wanted.num_clusters}x{wanted.rank}"
+
+
+def _fit_one(
+    path: Path,
+    name: str,
+    wanted: RepresentationConfig,
+    config: RunConfig,
+    transfer: TransferTensor,
+    metric: Metric,
+    progress: Any,
+) -> Fitted:
+    """Fit, or take what an earlier start of this run has finished."""
+    record = path.with_suffix(".json")
+    if record.exists() and path.exists():
+        return Fitted(name, load(path), **store.read_json(record))
+    start = time.perf_counter()
+    representation = CPCA.from_transfer(
+        transfer,
+        num_clusters=wanted.num_clusters,
+        rank=wanted.rank,
+        method=wanted.method,
+        metric=metric,
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+    checkpoint = path.with_suffix(".checkpoint")
+    result = fit(
+        representation,
+        transfer,
+        optimizer=config.fit.optimizer,
+        max_steps=config.fit.max_steps,
+        metric=metric,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+    outcome = {
+        "status": result.status,
+        "seconds": time.perf_counter() - start,
+        "condition": result.condition,
+    }
+    if result.status == "interrupted":
+        raise KeyboardInterrupt  # the checkpoint stays; starting again goes on from it
+    save(representation, path)
+    store.write_json(record, outcome)
+    checkpoint.unlink(missing_ok=True)
+    return Fitted(name, representation, **outcome)
+
+
+def _write_manifest(out: Path, transfer: TransferTensor) -> None:
+    """Sizes and hashes of all files of the run, and what it was made from."""
+    files = sorted(path for path in out.rglob("*") if path.is_file())
+    listed = {
+        str(path.relative_to(out)): {
+            "bytes": path.stat().st_size,
+            "sha256": store.file_sha256(path),
+        }
+        for path in files
+        if path.name != store.MANIFEST
+    }
+    content = {"inputs": transfer.provenance["inputs"], "files": listed}
+    store.write_json(out / store.MANIFEST, content)
