@@ -14,16 +14,18 @@ from typing import Annotated, Any, Literal
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from prt_torch.errors import InputError
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 Albedo = tuple[
@@ -39,7 +41,7 @@ class SceneConfig(_Section):
     mesh: str | None = Field(None, description="mesh file; null is the embedded procedural scene")
     ground: bool = Field(True, description="put a mesh file on a ground plane")
     ground_size: float = Field(4.0, gt=0, description="its edge, in horizontal extents of the mesh")
-    ground_resolution: int = Field(48, ge=2, description="points along its edge")
+    ground_resolution: int = Field(48, ge=2, le=2048, description="points along its edge")
     up: Literal["y", "z"] = Field("y", description="up axis of the mesh file")
     orientation: Literal["file", "flip", "outward"] = Field("file", description="facing of faces")
     albedo: Albedo | None = Field(None, description="linear RGB, in place of the file's colours")
@@ -63,6 +65,16 @@ class TransferConfig(_Section):
     order: int = Field(6, ge=1, le=64, description="bands of spherical harmonics")
     resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
     supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
+
+    @model_validator(mode="after")
+    def _rays_fill_whole_bytes(self) -> "TransferConfig":
+        if self.resolution * self.supersampling % 2:
+            raise PydanticCustomError(
+                "odd",
+                "resolution times supersampling must be even, got {resolution} times {factor}",
+                {"resolution": self.resolution, "factor": self.supersampling},
+            )
+        return self
 
 
 class CPCAConfig(_Section):
@@ -158,7 +170,11 @@ def parse_command_line(
             case _:
                 overrides.append(argument)
     points = _grid_points(overrides) if grid else [overrides]
-    return iter([load_config(config_dir, name, point) for point in points])
+    configs = [load_config(config_dir, name, point) for point in points]
+    folders = [config.out for config in configs if config.out is not None]
+    if len(set(folders)) < len(folders):
+        raise InputError(f"out: one folder cannot hold several runs of a grid, got {folders[0]!r}")
+    return iter(configs)
 
 
 def load_config(config_dir: Path, name: str, overrides: list[str]) -> RunConfig:
@@ -173,8 +189,9 @@ def load_config(config_dir: Path, name: str, overrides: list[str]) -> RunConfig:
     except OmegaConfBaseException as error:
         raise InputError(f"configuration: {_first_line(error)}") from error
     if isinstance(content, dict):
-        named = content.get("representations") or []
-        content["representations"] = [_by_name(config_dir, entry) for entry in named]
+        named = content.get("representations")
+        if isinstance(named, list):
+            content["representations"] = [_by_name(config_dir, entry) for entry in named]
     try:
         return RunConfig.model_validate(content)
     except ValidationError as error:
@@ -185,40 +202,67 @@ def _compose(config_dir: Path, name: str, overrides: list[str]) -> Any:
     if not (config_dir / f"{name}.yaml").is_file():
         choices = ", ".join(sorted(path.stem for path in config_dir.glob("*.yaml")))
         raise InputError(f"--config-name={name}: no such configuration; expected one of {choices}")
+    forced = [_forced(_parse(override, grid=False)) for override in overrides]
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_dir.resolve()), version_base="1.3"):
-            # Unknown keys go through, for the validation to name them beside the known ones.
-            return compose(name, overrides=[_forced(override) for override in overrides])
+            return compose(name, overrides=forced)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise InputError(f"configuration: {_explain(error)}") from error
 
 
-def _forced(override: str) -> str:
-    """``a.b=1`` as ``++a.b=1``: set whether or not the key is there; groups are left alone."""
-    key = override.partition("=")[0]
-    return f"++{override}" if "." in key or key in _TOP_LEVEL_VALUES else override
+_GROUPS = ("scene", "light", "transfer", "representation", "fit", "preview")
 
 
-_TOP_LEVEL_VALUES = tuple(
-    name
-    for name in RunConfig.model_fields
-    if name not in ("scene", "light", "transfer", "representation", "fit", "preview")
-)
+def _parse(override: str, *, grid: bool) -> Override:
+    """One override, with a key that is or lies in one of a run.
+
+    Raises:
+        InputError: If it is none, or lists several values outside a grid.
+    """
+    try:
+        parsed = OverridesParser.create().parse_override(override)
+    except HydraException as error:
+        raise InputError(
+            f"{override}: not KEY=VALUE; a value with special characters needs quotes of its own, "
+            "as in scene.mesh='\"a=b.obj\"'"
+        ) from error
+    key = parsed.get_key_element().lstrip("+~")
+    if key.partition(".")[0] not in RunConfig.model_fields:
+        choices = ", ".join(RunConfig.model_fields)
+        raise InputError(f"{key or override}: unknown key; expected one of {choices}")
+    if parsed.is_sweep_override():
+        if not grid:
+            raise InputError(f"{override}: several values; use -m for a grid, [a,b] for a list")
+    elif key in _GROUPS and not parsed.is_delete() and not isinstance(parsed.value(), str):
+        raise InputError(f"{key}: expected the name of a file in configs/{key}, got {override}")
+    return parsed
+
+
+def _forced(override: Override) -> str:
+    """``a.b=1`` as ``++a.b=1``: set whether or not the key is there; groups are left alone.
+
+    Unknown keys go through like this, for the validation to name them beside the known ones.
+    """
+    line = override.input_line or ""
+    if override.is_delete() or override.key_or_group in _GROUPS:
+        return line
+    return "++" + line.lstrip("+")
 
 
 def _grid_points(overrides: list[str]) -> list[list[str]]:
     """The product of all overrides that list several values."""
-    try:
-        parsed = OverridesParser.create().parse_overrides(overrides)
-        choices = [
-            [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
-            if one.is_sweep_override()
-            else [one.input_line or ""]
-            for one in parsed
-        ]
-    except HydraException as error:
-        raise InputError(f"configuration: {_explain(error)}") from error
+    choices = []
+    for override in overrides:
+        parsed = _parse(override, grid=True)
+        if not parsed.is_sweep_override():
+            choices.append([override])
+            continue
+        try:
+            values = list(parsed.sweep_string_iterator())
+        except HydraException as error:
+            raise InputError(f"{override}: {_first_line(error)}") from error
+        choices.append([f"{parsed.get_key_element()}={value}" for value in values])
     return [list(point) for point in itertools.product(*choices)]
 
 
@@ -241,10 +285,7 @@ def _explain(error: Exception) -> str:
         options = re.findall(r"^\t(\w+)$", text.partition("Available options")[2], re.MULTILINE)
         choices = ", ".join(options)
         return f"{missing[1]}: unknown {missing[2]!r}; expected one of {choices}"
-    override = re.search(r"Could not override '([^']+)'", text)
-    if override:
-        return f"{override[1]}: unknown key; expected one of {', '.join(RunConfig.model_fields)}"
-    return _first_line(error)
+    return _first_line(error).replace("++", "")
 
 
 def _first_line(error: Exception) -> str:
@@ -260,6 +301,8 @@ def _describe(error: ValidationError) -> str:
         *section, _ = problem["loc"]
         return f"{key}: unknown key; expected one of {', '.join(_keys_of(section))}{more}"
     message = problem["msg"][:1].lower() + problem["msg"][1:]
+    if isinstance(problem["input"], dict):  # a whole section would say nothing
+        return f"{key}: {message}{more}"
     given = repr(problem["input"])
     return f"{key}: {message}, got {given if len(given) < 80 else given[:77] + '...'}{more}"
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from prt_torch import store
+from prt_torch.errors import InputError
 from prt_torch.metric import Metric
 from prt_torch.representations import Representation
 from prt_torch.transfer import TransferTensor
@@ -211,18 +212,31 @@ class _Run:
             total += loss.detach().cpu()
         return total
 
+    def _kind(self) -> list[Any]:
+        """What a checkpoint must have been made with: the optimiser, and parameters by shape."""
+        shapes = [[name, list(p.shape)] for name, p in sorted(self.parameters.items())]
+        return [type(self.optimizer).__name__, shapes]
+
     def write(self, path: Path) -> None:
         """Everything that the next step depends on."""
         tensors = {f"parameter.{name}": p for name, p in self.parameters.items()}
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
         optimizer = _flatten(self.optimizer.state_dict(), tensors, "optimizer")
-        header = {"steps": self.steps, "history": self.history, "ended": self.ended}
-        header["best_error"] = self.best_error
-        store.write_tensors(path, tensors, {**header, "optimizer": optimizer})
+        header = {"kind": self._kind(), "steps": self.steps, "history": self.history}
+        header |= {"ended": self.ended, "best_error": self.best_error, "optimizer": optimizer}
+        store.write_tensors(path, tensors, {**header, "digest": _digest(header, tensors)})
 
     def resume(self, path: Path) -> None:
-        """Continue from :meth:`write`."""
+        """Continue from :meth:`write`.
+
+        Raises:
+            InputError: If the checkpoint is damaged or of another fit.
+        """
         tensors, header = store.read_tensors(path)
+        if not isinstance(header, dict) or header.pop("digest", None) != _digest(header, tensors):
+            raise InputError(f"{path}: the checkpoint is damaged; remove it to fit from the start")
+        if header["kind"] != self._kind():
+            raise InputError(f"{path}: is the checkpoint of another fit; remove it or choose another")
         with torch.no_grad():
             for name, parameter in self.parameters.items():
                 parameter.copy_(tensors[f"parameter.{name}"])
@@ -230,6 +244,11 @@ class _Run:
         self.optimizer.load_state_dict(_unflatten(header["optimizer"], tensors))
         self.steps, self.history = header["steps"], header["history"]
         self.best_error, self.ended = header["best_error"], header["ended"]
+
+
+def _digest(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of a checkpoint's content."""
+    return store.digest(header, *(part for item in sorted(tensors.items()) for part in item))
 
 
 def _root_mean_square(parameter: Tensor) -> float:

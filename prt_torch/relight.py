@@ -72,12 +72,16 @@ class Relighter(nn.Module):
         return torch.cat([self._relight(some, rows, frames) for some in light.split(at_once)])
 
     def _relight(self, light: Tensor, rows: Tensor | None, frames: Tensor | None) -> Tensor:
+        reflectance = self.representation.reflectance
+        shared = len(reflectance) == 1
+        if shared:  # as well times the few coefficients of the light as times every point
+            light = light * reflectance
         radiance = self.representation(light, frames)
         if rows is None:
             radiance = radiance[:, None, :, 0]
         else:
             radiance = torch.einsum("bprc,vpr->bvpc", radiance, rows)
-        return radiance * self.representation.reflectance
+        return radiance if shared else radiance * reflectance
 
     def _view_rows(
         self, views: Tensor | None, frames: Tensor | None

@@ -36,6 +36,8 @@ from prt_torch.report import summary_table
 from prt_torch.representations import CPCA, load, save
 from prt_torch.transfer import TransferTensor
 
+CONFIG, RESULTS, PICTURES = "config.yaml", "results", "pictures"
+
 
 def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]:
     """Do a whole run and return its report.
@@ -53,8 +55,9 @@ def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]
     _warn(inputs.mesh, console)
     out = run_folder(config)
     with store.locked(out, what="output folder"):
-        _claim(out, config)
+        _check_folder(out, config, inputs)
         transfer = _bake(config, inputs, console)
+        store.write_bytes(out / CONFIG, _claim(config, inputs).encode())
         fitted = _fit_all(out, config, inputs, transfer, console)
         console.print("evaluating and drawing ...")
         report = write_report(
@@ -144,6 +147,9 @@ def _load(config: RunConfig) -> Inputs:
     names = [environment.name for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
+    results = [_name(wanted) for wanted in config.fitted]
+    if len(set(results)) != len(results):
+        raise InputError(f"representations: expected different ones, got {', '.join(results)}")
     fine = config.transfer.resolution * config.transfer.supersampling
     check_memory(inputs.light_basis, fine, config.memory_budget)
     return inputs
@@ -157,14 +163,22 @@ def _light_basis(config: RunConfig) -> LightBasis:
             return CubeDirections(config.transfer.resolution)
 
 
-def _claim(out: Path, config: RunConfig) -> None:
-    """Write the configuration, or make sure that the folder holds the same one."""
-    path = out / "config.yaml"
-    text = OmegaConf.to_yaml(OmegaConf.create(_identity(config)))
-    if not path.exists():
-        store.write_bytes(path, text.encode())
-    elif path.read_text() != text:
+def _claim(config: RunConfig, inputs: Inputs) -> str:
+    """What the results of a run follow from: its configuration, and what the files held."""
+    mesh, lights = inputs.mesh, [*inputs.fit_lights, *inputs.test_lights]
+    surface = (mesh.vertices, mesh.faces, mesh.normals, mesh.albedo)
+    light = (part for one in lights for part in (one.image, one.rotation))
+    hashed = store.digest(*surface, *light)
+    return f"# inputs {hashed}\n{OmegaConf.to_yaml(OmegaConf.create(_identity(config)))}"
+
+
+def _check_folder(out: Path, config: RunConfig, inputs: Inputs) -> None:
+    """Make sure that a run folder holds nothing, or this run; remove what a killed one left."""
+    path = out / CONFIG
+    if path.exists() and path.read_bytes() != _claim(config, inputs).encode():
         raise InputError(f"{out}: output folder holds another run; choose another or remove it")
+    for folder in (out / RESULTS, out / PICTURES):
+        store.remove_temporaries(folder)
 
 
 def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor:
@@ -209,17 +223,14 @@ def _fit_all(
     if config.fit.metric == "light_prior":
         lights = torch.stack([inputs.light_basis.project(light) for light in inputs.fit_lights])
         metric = Metric.light_prior(lights, inputs.light_basis)
-    fitted, names = [], set()
+    fitted = []
     with _progress(console) as progress:
         for wanted in config.fitted:
             name = _name(wanted)
-            if name in names:
-                raise InputError(f"representations: {name} is asked for twice")
-            names.add(name)
             task = progress.add_task(f"fit {name}", total=config.fit.max_steps or 1)
             fitted.append(
                 _fit_one(
-                    out / "results" / f"{file_name(name)}.safetensors",
+                    out / RESULTS / f"{file_name(name)}.safetensors",
                     name,
                     wanted,
                     config,
@@ -248,7 +259,9 @@ def _fit_one(
 ) -> Fitted:
     """Fit, or take what an earlier start of this run has finished."""
     record = path.with_suffix(".json")
+    checkpoint = path.with_suffix(".checkpoint")
     if record.exists() and path.exists():
+        checkpoint.unlink(missing_ok=True)
         return Fitted(name, load(path), **store.read_json(record))
     start = time.perf_counter()
     representation = CPCA.from_transfer(
@@ -259,7 +272,6 @@ def _fit_one(
         metric=metric,
         generator=torch.Generator().manual_seed(config.seed),
     )
-    checkpoint = path.with_suffix(".checkpoint")
     result = fit(
         representation,
         transfer,
@@ -284,14 +296,14 @@ def _fit_one(
 
 def _write_manifest(out: Path, transfer: TransferTensor) -> None:
     """Sizes and hashes of all files of the run, and what it was made from."""
-    files = sorted(path for path in out.rglob("*") if path.is_file())
+    written = [out / CONFIG, out / "report.html", out / "report.json"]
+    files = sorted([*written, *(out / RESULTS).iterdir(), *(out / PICTURES).iterdir()])
     listed = {
         str(path.relative_to(out)): {
             "bytes": path.stat().st_size,
             "sha256": store.file_sha256(path),
         }
         for path in files
-        if path.name != store.MANIFEST
     }
     content = {"inputs": transfer.provenance["inputs"], "files": listed}
     store.write_json(out / store.MANIFEST, content)

@@ -111,15 +111,15 @@ def read_tensors(path: Path, sha256: str | None = None) -> tuple[dict[str, Tenso
         raise InputError(f"{path}: SHA-256 differs from the one recorded; the file is damaged")
     try:
         with safe_open(str(path), framework="pt") as file:
-            metadata = (file.metadata() or {}).get("metadata")
+            metadata = json.loads((file.metadata() or {}).get("metadata", "null"))
             # Cloned: tensors in the file's memory are not aligned, and sums over them may differ
             # in the last bit from the same sums over aligned ones.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable safetensors file ({error})") from error
-    return tensors, json.loads(metadata) if metadata else None
+    return tensors, metadata
 
 
 def file_sha256(path: Path) -> str:
@@ -155,7 +155,8 @@ def locked(folder: Path, *, what: str = "folder", wait: bool = False) -> Iterato
     """Hold ``folder`` for this process alone, making it if need be.
 
     The lock is on the folder itself, so no lock file is left, and the kernel drops it when the
-    process ends, however it ends. Temporary files of a killed writer are removed.
+    process ends, however it ends. Temporary files of a killed writer are removed, those in
+    subfolders by :func:`remove_temporaries`.
 
     Args:
         folder: The folder.
@@ -168,27 +169,47 @@ def locked(folder: Path, *, what: str = "folder", wait: bool = False) -> Iterato
         InputError: If another process holds the folder, or it cannot be made or written.
     """
     folder = Path(folder)
-    made = not folder.exists()
+    descriptor, made = _open_locked(folder, what, wait)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise InputError(f"{folder}: {what} cannot be made ({error.strerror})") from error
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except OSError as error:
-            raise InputError(f"{folder}: {what} is in use by another run") from error
         if not os.access(folder, os.W_OK):
             raise InputError(f"{folder}: {what} is not writable")
-        for stray in folder.glob(f"{_TEMPORARY}*"):
-            stray.unlink(missing_ok=True)
+        remove_temporaries(folder)
         yield folder
     finally:
         if made:
             with suppress(OSError):  # not empty: something was written and stays
                 folder.rmdir()
         os.close(descriptor)
+
+
+def _open_locked(folder: Path, what: str, wait: bool) -> tuple[int, bool]:
+    """A descriptor of the locked folder, and whether the folder was made here."""
+    while True:
+        try:
+            made = not folder.exists()
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(folder, os.O_RDONLY)
+        except OSError as error:
+            raise InputError(f"{folder}: {what} cannot be made ({error.strerror})") from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if os.path.samestat(os.fstat(descriptor), folder.stat()):
+                return descriptor, made
+        except BlockingIOError as error:
+            os.close(descriptor)
+            raise InputError(f"{folder}: {what} is in use by another run") from error
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            os.close(descriptor)
+            raise InputError(f"{folder}: {what} cannot be locked ({error.strerror})") from error
+        os.close(descriptor)  # the holder before removed the folder: what is locked is not there
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove what killed writers left in a folder that is locked, or lies in a locked one."""
+    for stray in folder.glob(f"{_TEMPORARY}*"):
+        stray.unlink(missing_ok=True)
 
 
 class ShardedTensor:

@@ -14,3 +14,10 @@ def assets() -> Path:
     if not (folder / "meshes").is_dir():
         pytest.skip("real assets are absent: set PRT_TORCH_ASSETS to their folder")
     return folder
+
+
+@pytest.fixture
+def without_type_checker(request: pytest.FixtureRequest) -> None:
+    """For tests that pass wrong types on purpose, which jaxtyping's plug-in refuses first."""
+    if request.config.getoption("jaxtyping_packages", default=None):
+        pytest.skip("annotations are checked at run time")

@@ -83,6 +83,18 @@ def test_error_falls_with_rank_and_with_clusters():
     assert by_clusters == sorted(by_clusters, reverse=True)
 
 
+def test_evaluating_and_differentiating_forward_agree():
+    """The gathering path without gradients against the grouped one with them."""
+    for dtype, limit in [(torch.float32, 2e-6), (torch.float64, 1e-14)]:
+        transfer = random_transfer(points=500, rows=2, coeffs=16, dtype=dtype)
+        model = CPCA.from_transfer(transfer, num_clusters=7, rank=3)
+        light = torch.randn(3, 16, 3, dtype=dtype)
+        with torch.no_grad():
+            gathered = model(light)
+        assert model(light).requires_grad
+        assert relative(gathered, model(light)) < limit
+
+
 def test_more_clusters_than_distinct_points():
     generator = torch.Generator().manual_seed(0)
     distinct = torch.randn(3, 20, generator=generator)

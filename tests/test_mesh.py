@@ -383,7 +383,9 @@ class TestPlacement:
 
     def test_transform_acts_on_columns_after_up_and_keeps_outsides(self, tmp_path):
         path = write(tmp_path, "a.obj", obj_text())
-        matrix = [[-2.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+        matrix = np.diag([-2.0, 1, 1, 1])
+        matrix[:3, 3] = 1, 2, 3
+        matrix = matrix.tolist()
         mesh = load_mesh(path, transform=matrix)
         np.testing.assert_array_equal(mesh.vertices, CUBE_VERTICES * [-2, 1, 1] + [1, 2, 3])
         assert mesh.warnings == ()
@@ -392,18 +394,23 @@ class TestPlacement:
     @pytest.mark.parametrize(
         ("option", "message"),
         [
-            ({"transform": np.zeros((4, 4))}, "last row"),
-            ({"transform": np.diag([1.0, 1, 0, 1])}, "singular"),
-            ({"transform": np.eye(3)}, "4 rows"),
-            ({"transform": np.diag([1.0, math.nan, 1, 1])}, "finite"),
-            ({"up": "x"}, "scene.up"),
-            ({"orientation": "inward"}, "scene.orientation"),
+            ({"transform": np.zeros((4, 4)).tolist()}, "last row"),
+            ({"transform": np.diag([1.0, 1, 0, 1]).tolist()}, "singular"),
+            ({"transform": np.eye(3).tolist()}, "4 rows"),
+            ({"transform": np.diag([1.0, math.nan, 1, 1]).tolist()}, "finite"),
             ({"albedo": (0.5, 1.5, 0.5)}, "scene.albedo"),
         ],
     )
     def test_bad_options(self, tmp_path, option, message):
         path = write(tmp_path, "a.obj", obj_text())
         with pytest.raises(InputError, match=message):
+            load_mesh(path, **option)
+
+    @pytest.mark.usefixtures("without_type_checker")
+    @pytest.mark.parametrize("option", [{"up": "x"}, {"orientation": "inward"}])
+    def test_unknown_choices(self, tmp_path, option):
+        path = write(tmp_path, "a.obj", obj_text())
+        with pytest.raises(InputError, match=f"scene.{next(iter(option))}=.*expected"):
             load_mesh(path, **option)
 
 

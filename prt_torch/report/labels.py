@@ -96,8 +96,8 @@ def _boxes(
 
 
 def _overlaps(
-    first: Float64[np.ndarray, "*batch 4"], second: Float64[np.ndarray, "*batch 4"]
-) -> Float64[np.ndarray, "*batch"]:
+    first: Float64[np.ndarray, "*#batch 4"], second: Float64[np.ndarray, "*#batch 4"]
+) -> Float64[np.ndarray, "..."]:
     """Common areas of boxes, in square pixels."""
     sides = np.minimum(first[..., 2:], second[..., 2:]) - np.maximum(
         first[..., :2], second[..., :2]

@@ -124,7 +124,7 @@ def _plot(
     for index, panel in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), index + 1)
         points = [
-            _Point(row.name, row.representation, x, y if y > panel.rounding else 0.0)
+            _Point(row.name, row.representation, float(x), y if y > panel.rounding else 0.0)
             for row in rows
             if (x := cost(row)) and x > 0 and (y := panel.error(row)) is not None and y >= 0
         ]
@@ -169,7 +169,7 @@ def _uncompressed(
         error = uncompressed_reference_error(own) if joint else 0.0
         if cost:
             name = f"{run.name}: {_UNCOMPRESSED}"
-            points.setdefault((cost, error), _Point(name, "", cost, error))
+            points.setdefault((cost, error), _Point(name, "", float(cost), error))
     if len(points) == 1:
         return [replace(point, name=_UNCOMPRESSED) for point in points.values()]
     return list(points.values())

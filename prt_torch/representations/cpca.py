@@ -29,8 +29,7 @@ class CPCA(Representation):
     """Clustered affine subspaces of transfer.
 
     Parameters are ``representatives`` ``"clusters rank+1 channels rows coeffs"``, the mean first,
-    and ``weights`` ``"slots rank"`` in the sorted, padded order of
-    :class:`~prt_torch.representations.grouped.ClusterBlocks`. The vectors come orthonormal (in the
+    and ``weights`` ``"points rank"``. The vectors come orthonormal (in the
     metric) from the closed form and are free afterwards: any invertible mixture of them with the
     inverse mixture of the weights is the same transfer, so a constraint would only slow a fit.
 
@@ -42,6 +41,8 @@ class CPCA(Representation):
 
     kind: ClassVar[str] = "cpca"
     labels: Tensor
+    _own_vectors: Tensor
+    _own_borders: Tensor
 
     def __init__(self, encoding: Encoding, surface: Surface, shape: tuple[int, int, int, int]):
         super().__init__(surface, shape)
@@ -51,8 +52,14 @@ class CPCA(Representation):
         self.representatives = nn.Parameter(
             encoding.representatives.unflatten(-1, shape[1:]).contiguous()
         )
-        self.weights = nn.Parameter(self.blocks.to_slots(encoding.weights))
+        self.weights = nn.Parameter(encoding.weights.clone())
         self.register_buffer("labels", encoding.labels)
+        vectors = self.rank + 1
+        steps = torch.arange(vectors, device=encoding.labels.device)
+        own = (encoding.labels[:, None] * vectors + steps).int().flatten()
+        borders = torch.arange(0, len(own) + 1, vectors, dtype=torch.int32, device=own.device)
+        self.register_buffer("_own_vectors", own, persistent=False)
+        self.register_buffer("_own_borders", borders, persistent=False)
 
     @classmethod
     def from_transfer(
@@ -125,9 +132,30 @@ class CPCA(Representation):
         if self._check_light(light):
             return self._forward_local(light)
         lit = self._light_representatives(light)  # clusters, rank+1, rows * batch * rgb
-        slots = self.blocks.matmul(self.weights, lit[:, 1:], offsets=lit[:, 0])
-        radiance = self.blocks.to_points(slots)
-        return radiance.view(self.num_points, self.num_rows, -1, 3).permute(2, 0, 1, 3)
+        wants_grad = lit.requires_grad or self.weights.requires_grad
+        mix = self._mix_grouped if torch.is_grad_enabled() and wants_grad else self._mix_gathered
+        return mix(lit).view(self.num_points, self.num_rows, -1, 3).permute(2, 0, 1, 3)
+
+    def _mix_grouped(self, vectors: Tensor) -> Float[Tensor, "points values"]:
+        """Weighted sums of each point's own vectors, by batched products: fast to differentiate."""
+        slots = self.blocks.to_slots(self.weights)
+        mixed = self.blocks.matmul(slots, vectors[:, 1:], offsets=vectors[:, 0])
+        return self.blocks.to_points(mixed)
+
+    def _mix_gathered(self, vectors: Tensor) -> Float[Tensor, "points values"]:
+        """The same in one pass that writes every result once and in place: fast to evaluate.
+
+        The lit vectors of all clusters stay in the processor's cache.
+        """
+        mixture = torch.cat([torch.ones_like(self.weights[:, :1]), self.weights], dim=1)
+        return nn.functional.embedding_bag(
+            self._own_vectors,
+            vectors.flatten(0, 1),
+            self._own_borders,
+            mode="sum",
+            per_sample_weights=mixture.flatten(),
+            include_last_offset=True,
+        )
 
     def _light_representatives(self, light: Tensor) -> Tensor:
         clusters, vectors, channels, _, coeffs = self.representatives.shape
@@ -142,7 +170,7 @@ class CPCA(Representation):
     def _forward_local(self, light: Tensor) -> Tensor:
         """Each point's own light meets its cluster's representatives, then its weights."""
         ones = torch.ones_like(self.weights[:, :1])
-        mixture = torch.cat([ones, self.weights], dim=1)
+        mixture = self.blocks.to_slots(torch.cat([ones, self.weights], dim=1))
         by_point = self.blocks.to_slots(light.permute(1, 3, 0, 2))  # slots rgb batch coeffs
         colours = []
         for colour in range(3):
@@ -158,11 +186,10 @@ class CPCA(Representation):
         """Mean plus weighted vectors of each point."""
         flat = self.representatives.flatten(2)
         if points is None:
-            slots = self.blocks.matmul(self.weights, flat[:, 1:], offsets=flat[:, 0])
-            values = self.blocks.to_points(slots)
+            values = self._mix_grouped(flat)
         else:
             own = flat[self.labels[points]]
-            weights = self.weights[self.blocks.slot_of_point[points]]
+            weights = self.weights[points]
             values = torch.baddbmm(own[:, :1], weights[:, None], own[:, 1:])[:, 0]
         return values.view(-1, self.num_channels, self.num_rows, self.num_coeffs)
 
@@ -177,7 +204,7 @@ class CPCA(Representation):
                 index_type = torch.int32
         return {
             "representatives": self.representatives.detach().clone(),
-            "weights": self.blocks.to_points(self.weights.detach()),
+            "weights": self.weights.detach().clone(),
             "labels": self.labels.to(index_type),
         }
 
