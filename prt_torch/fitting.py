@@ -236,7 +236,7 @@ class _Run:
         if not isinstance(header, dict) or header.pop("digest", None) != _digest(header, tensors):
             raise InputError(f"{path}: the checkpoint is damaged; remove it to fit from the start")
         if header["kind"] != self._kind():
-            raise InputError(f"{path}: is the checkpoint of another fit; remove it or choose another")
+            raise InputError(f"{path}: is the checkpoint of another fit; remove or rename it")
         with torch.no_grad():
             for name, parameter in self.parameters.items():
                 parameter.copy_(tensors[f"parameter.{name}"])

@@ -144,7 +144,7 @@ def _load(config: RunConfig) -> Inputs:
     inputs = Inputs(mesh, find(light.fit), find(light.test), _light_basis(config))
     if config.fit.metric == "light_prior" and not inputs.fit_lights:
         raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
-    names = [environment.name for environment in inputs.test_lights]
+    names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
     results = [_name(wanted) for wanted in config.fitted]
