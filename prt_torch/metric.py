@@ -8,7 +8,6 @@ weighs errors by the light that is expected: then the squared norm of a transfer
 expected squared radiance error.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch.bases import LightBasis
+from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
 _MAX_PRIOR_COEFFS = 2048  # its matrix has the square of it
@@ -73,7 +73,7 @@ class Metric:
             raise ValueError("a light prior needs at least one light")
         moment = torch.zeros(coeffs, coeffs, dtype=torch.float64)
         for turn in range(turns):
-            turned = light_basis.rotate(lights.double(), about_up(2.0 * math.pi * turn / turns))
+            turned = light_basis.rotate(lights.double(), rotation_about_up(360.0 * turn / turns))
             power = turned.square().sum((1, 2), keepdim=True)
             unit = (turned / torch.where(power > 0, power, 1.0).sqrt()).movedim(1, 0).flatten(1)
             moment += unit @ unit.mT
@@ -92,10 +92,3 @@ class Metric:
         if factor.ndim == 1:
             return values / factor
         return torch.linalg.solve_triangular(factor, values, upper=False, left=False)
-
-
-def about_up(angle: float) -> Float[Tensor, "3 3"]:
-    """Rotation about +y by an angle [rad], counter-clockwise seen from above, float64."""
-    cosine, sine = math.cos(angle), math.sin(angle)
-    rows = [[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]]
-    return torch.tensor(rows, dtype=torch.float64)

@@ -4,6 +4,8 @@ Everything is computed in float64 and cast at the end. Conventions are stated in
 :mod:`prt_torch.conventions`.
 """
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -95,3 +97,12 @@ def frame_from_normal(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
     tangent = torch.stack([1 - x * x * scale, -x, -x * z * scale], dim=-1)
     bitangent = torch.linalg.cross(normal, tangent)
     return torch.stack([tangent, bitangent, normal], dim=-2)
+
+
+def rotation_about_up(degrees: float) -> Float[Tensor, "3 3"]:
+    """Rotation about +y, counter-clockwise seen from above: +x turns towards -z. Float64."""
+    angle = math.radians(degrees)
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return torch.tensor(
+        [[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]], dtype=torch.float64
+    )

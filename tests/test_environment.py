@@ -16,10 +16,10 @@ from prt_torch.assets import (
     constant,
     find_environment,
     load_environment,
-    rotation_about_up,
     sky,
 )
 from prt_torch.errors import InputError
+from prt_torch.sphere import rotation_about_up
 
 AHEAD, RIGHT, UP = ([0.0, 0, -1], [1.0, 0, 0], [0.0, 1, 0])
 BEHIND, LEFT, DOWN = ([0.0, 0, 1], [-1.0, 0, 0], [0.0, -1, 0])

@@ -110,7 +110,7 @@ def test_damaged_checkpoint(tmp_path):
     path = tmp_path / "fit.checkpoint"
     path.write_bytes(b"not a checkpoint")
     transfer = random_transfer()
-    with pytest.raises(InputError, match="fit.checkpoint"):
+    with pytest.raises(InputError, match=r"fit\.checkpoint"):
         fit(disturbed(transfer), transfer, checkpoint=path)
 
 
@@ -179,7 +179,9 @@ def test_fitting_for_a_light_prior_lowers_radiance_errors_under_it():
     prior = Metric.light_prior(light, SphericalHarmonics(6))
     exact = DenseTransfer.from_transfer(transfer)(light)
     errors = [
-        float((CPCA.from_transfer(transfer, num_clusters=4, rank=1, metric=m)(light) - exact).norm())
+        float(
+            (CPCA.from_transfer(transfer, num_clusters=4, rank=1, metric=m)(light) - exact).norm()
+        )
         for m in (None, prior)
     ]
     assert errors[1] < 0.7 * errors[0]

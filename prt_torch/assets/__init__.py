@@ -1,6 +1,6 @@
 """What a bake is made of: meshes, environments and materials, validated and frozen."""
 
-from prt_torch.assets.environment import Environment, load_environment, rotation_about_up
+from prt_torch.assets.environment import Environment, load_environment
 from prt_torch.assets.lights import NAMED, area_lights, constant, find_environment, sky, sunset
 from prt_torch.assets.mesh import (
     DEFAULT_ALBEDO,
@@ -31,7 +31,6 @@ __all__ = [
     "mesh_from_arrays",
     "procedural_scene",
     "read_hdr",
-    "rotation_about_up",
     "sky",
     "sunset",
 ]

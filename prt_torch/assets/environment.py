@@ -30,6 +30,7 @@ from prt_torch import conventions, sphere
 from prt_torch.assets.exr import read_exr
 from prt_torch.assets.rgbe import read_hdr
 from prt_torch.errors import InputError
+from prt_torch.sphere import rotation_about_up
 
 _READERS = {".hdr": read_hdr, ".exr": read_exr}
 _ASPECT_TOLERANCE = 0.02
@@ -224,15 +225,6 @@ def _bilinear(
     above = (1 - across) * image[(*face, top, left)] + across * image[(*face, top, right)]
     under = (1 - across) * image[(*face, below, left)] + across * image[(*face, below, right)]
     return (1 - down) * above + down * under
-
-
-def rotation_about_up(degrees: float) -> Float64[Tensor, "3 3"]:
-    """Rotation about +y, counter-clockwise seen from above: +x turns towards -z."""
-    angle = math.radians(degrees)
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return torch.tensor(
-        [[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]], dtype=torch.float64
-    )
 
 
 # (row, col) of the faces in a cross, in the order +x, -x, +y, -y, +z, -z.

@@ -60,8 +60,13 @@ class VisibilityField:
         return torch.from_numpy(np.unpackbits(self.bits[rows].numpy(), axis=1))
 
 
-class _Tracer:
-    """Embree over one scene, with buffers that are reused from ray batch to ray batch."""
+class Tracer:
+    """Embree over one scene: rays from its points towards the texels of a cube map.
+
+    Args:
+        mesh: The scene.
+        resolution: Texels along an edge of a face.
+    """
 
     def __init__(self, mesh: Mesh, resolution: int):
         low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
@@ -81,6 +86,16 @@ class _Tracer:
             range(1)
         )  # Embree builds its hierarchy on the first query, not safely from two threads
 
+    def rays(self, point: int) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions of the rays of one point, ``"rays 3"`` each."""
+        above = self._above(point)
+        targets = self._directions[above]
+        return np.tile(self._origins[point], (len(above), 1)), targets
+
+    def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Bare Embree any-hit queries: 0 where a ray hits something, -1 where it is free."""
+        return self._scene.run(origins, directions, query="OCCLUDED")
+
     def trace(self, points: range) -> tuple[np.ndarray, int]:
         """Packed bits of some points, and how many rays that took."""
         num_texels = len(self._directions)
@@ -89,19 +104,22 @@ class _Tracer:
         origins = np.empty((num_texels, 3), np.float32)
         rays = 0
         for row, point in enumerate(points):
-            above = np.flatnonzero(self._normals[point] @ self._by_axis > 0)
+            above = self._above(point)
             count = len(above)
             if count == 0:
                 continue
             np.take(self._directions, above, axis=0, out=targets[:count], mode="clip")
             for axis in range(3):
                 origins[:count, axis] = self._origins[point, axis]
-            hit = self._scene.run(origins[:count], targets[:count], query="OCCLUDED")
             free = np.zeros(num_texels, bool)
-            free[above] = hit == _FREE
+            free[above] = self.occluded(origins[:count], targets[:count]) == _FREE
             bits[row] = np.packbits(free)
             rays += count
         return bits, rays
+
+    def _above(self, point: int) -> np.ndarray:
+        """Texels above the horizon of a point."""
+        return np.flatnonzero(self._normals[point] @ self._by_axis > 0)
 
 
 def trace_visibility(
@@ -132,12 +150,12 @@ def trace_visibility(
     if min(resolution, supersampling) < 1 or fine % 2:
         raise ValueError(f"expected resolution times supersampling to be even, got {fine}")
     texels = 6 * fine * fine
-    tracer: list[_Tracer] = []
+    tracer: list[Tracer] = []
 
     def trace(rows: slice) -> tuple[dict[str, Tensor], dict[str, float]]:
         start = time.perf_counter()
         if not tracer:  # built only when there is something to trace
-            tracer.append(_Tracer(mesh, fine))
+            tracer.append(Tracer(mesh, fine))
         bits, rays = _trace_in_threads(tracer[0], rows)
         return {"bits": bits}, {"rays": rays, "seconds": time.perf_counter() - start}
 
@@ -165,7 +183,7 @@ def trace_visibility(
     )
 
 
-def _trace_in_threads(tracer: _Tracer, rows: slice) -> tuple[Tensor, int]:
+def _trace_in_threads(tracer: Tracer, rows: slice) -> tuple[Tensor, int]:
     """Trace a block of points with as many threads as torch uses; Embree releases the GIL."""
     workers = torch.get_num_threads()
     points = range(rows.start, rows.stop)
