@@ -30,11 +30,12 @@ def report(arguments: list[str]) -> None:
             raise InputError(f"{argument}: unknown option; {USAGE}")
         else:
             runs.append(Path(argument))
-    gathered = gather([store.read_json(run / "report.json") for run in runs])
+    reports = [store.read_json(run / "report.json") for run in runs]
+    gathered = gather(reports, names=[str(run) for run in runs])
     with store.locked(out, what="output folder"):
         store.write_json(out / "report.json", gathered)
         write_html(out / "report.html", gathered, [])
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)
     console.print(summary_table(gathered))
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
 

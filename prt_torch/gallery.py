@@ -73,14 +73,14 @@ def draw(
     Raises:
         InputError: If a file cannot be written.
     """
-    camera = Camera.framing(mesh)
+    camera = Camera.framing(mesh, aspect=width / height)
     hits = trace(mesh, camera, width, height)
     pictures = []
     for light in lit:
         pictures += _draw_light(folder, hits, light)
     drawn = False
     if opengl:
-        exposure = automatic_exposure(hits.shade(lit[0].reference, lit[0].environment))
+        exposure = _exposure(hits, lit[0])
         drawn = _draw_opengl(folder, mesh, camera, lit[0], width, height, exposure)
     return pictures + _draw_errors(folder, hits, errors), drawn
 
@@ -93,7 +93,7 @@ def file_name(text: str) -> str:
 def _draw_light(folder: Path, hits: PrimaryHits, light: Lit) -> list[Picture]:
     stem, group = file_name(light.environment.name), f"Lit by {light.environment.name}"
     reference = hits.shade(light.reference, light.environment)
-    exposure = automatic_exposure(reference)
+    exposure = _exposure(hits, light)
     plain = encode_png(tone_map(reference, exposure))
     store.write_bytes(folder / f"{stem}-uncompressed.png", plain)
     write_exr(folder / f"{stem}-uncompressed.exr", reference)
@@ -113,6 +113,11 @@ def _draw_light(folder: Path, hits: PrimaryHits, light: Lit) -> list[Picture]:
             Picture("difference", f"of {name}", difference_png, group, scale),
         ]
     return pictures
+
+
+def _exposure(hits: PrimaryHits, light: Lit) -> float:
+    """One exposure for all pictures of a light: that of the mesh, whatever is behind it."""
+    return automatic_exposure(hits.shade(light.reference))
 
 
 def _draw_opengl(

@@ -105,6 +105,16 @@ def gltf_document(vertices=CUBE_VERTICES, faces=CUBE_FACES, nodes=None, extra=No
     return document, positions + indices
 
 
+def add_accessor(document, binary, values, accessor, stride=None):
+    """Append an accessor and its bytes; the longer buffer."""
+    content = np.ascontiguousarray(values).tobytes()
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(content)}
+    document["bufferViews"].append(view if stride is None else {**view, "byteStride": stride})
+    document["accessors"].append({"bufferView": len(document["bufferViews"]) - 1, **accessor})
+    document["buffers"][0]["byteLength"] = len(binary + content)
+    return binary + content
+
+
 def glb_bytes(document, binary, length=None):
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
@@ -341,6 +351,93 @@ class TestFormats:
         mesh = load_mesh(write(tmp_path, "red.glb", glb_bytes(document, binary)))
         np.testing.assert_allclose(mesh.albedo, np.tile([0.1, 0.2, 0.3], (8, 1)))
 
+    def test_gltf_16_bit_colours_multiply_the_material(self, tmp_path):
+        document, binary = gltf_document(
+            extra={"materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0.1, 1]}}]}
+        )
+        colours = np.tile(np.array([65535, 32768, 1000, 65535], "<u2"), (8, 1))
+        attribute = {"componentType": 5123, "count": 8, "type": "VEC4", "normalized": True}
+        binary = add_accessor(document, binary, colours, attribute)
+        document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 2
+        document["meshes"][0]["primitives"][0]["material"] = 0
+        mesh = load_mesh(write(tmp_path, "c.glb", glb_bytes(document, binary)))
+        expected = np.array([1.0, 0.5 * 32768 / 65535, 0.1 * 1000 / 65535])
+        np.testing.assert_allclose(mesh.albedo, np.tile(expected, (8, 1)), rtol=1e-12)
+
+    def test_gltf_quantised_positions_are_fractions(self, tmp_path):
+        document, binary = gltf_document(extra={"extensionsRequired": ["KHR_mesh_quantization"]})
+        rows = np.pad(CUBE_VERTICES * 32767, ((0, 0), (0, 1))).astype("<i2")
+        attribute = {"componentType": 5122, "count": 8, "type": "VEC3", "normalized": True}
+        binary = add_accessor(document, binary, rows, attribute, stride=8)
+        document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = 2
+        self.check_cube(load_mesh(write(tmp_path, "q.glb", glb_bytes(document, binary))))
+
+    def test_gltf_primitives_of_one_mesh_share_its_points(self, tmp_path):
+        document, binary = gltf_document(faces=CUBE_FACES[:4])
+        rest = np.asarray(CUBE_FACES[4:], "<u2")
+        attribute = {"componentType": 5123, "count": rest.size, "type": "SCALAR"}
+        binary = add_accessor(document, binary, rest, attribute)
+        primitives = document["meshes"][0]["primitives"]
+        primitives.append({**primitives[0], "indices": 2})
+        self.check_cube(load_mesh(write(tmp_path, "p.glb", glb_bytes(document, binary))))
+
+    @pytest.mark.parametrize(
+        "nodes",
+        [
+            [{"mesh": 0, "camera": 0, "translation": [5, 0, 0]}],
+            [{"camera": 0, "translation": [5, 0, 0], "children": [1]}, {"mesh": 0}],
+        ],
+    )
+    def test_gltf_cameras_hide_no_mesh(self, tmp_path, nodes):
+        lens = {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}
+        data = glb_bytes(*gltf_document(nodes=nodes, extra={"cameras": [lens]}))
+        mesh = load_mesh(write(tmp_path, "camera.glb", data))
+        np.testing.assert_array_equal(mesh.vertices, CUBE_VERTICES + [5, 0, 0])
+
+    def test_gltf_without_a_scene_takes_the_nodes_without_parents(self, tmp_path):
+        document, binary = gltf_document()
+        del document["scene"], document["scenes"]
+        self.check_cube(load_mesh(write(tmp_path, "n.glb", glb_bytes(document, binary))))
+
+    def test_gltf_rounded_rotation_does_not_scale(self, tmp_path):
+        nodes = [{"mesh": 0, "rotation": [0, 0.7, 0, 0.7]}]
+        mesh = load_mesh(write(tmp_path, "r.glb", glb_bytes(*gltf_document(nodes=nodes))))
+        x, y, z = CUBE_VERTICES.T
+        np.testing.assert_allclose(mesh.vertices, np.stack([z, y, -x], axis=1), atol=1e-14)
+
+    def test_gltf_tree_agrees_with_a_second_loader(self, tmp_path):
+        generator = np.random.default_rng(5)
+        nodes = [{"children": [1, 2]}, {"children": [3, 4]}, {"mesh": 0}, {"mesh": 0}, {"mesh": 0}]
+        for index, node in enumerate(nodes):
+            quaternion = generator.normal(size=4)
+            node["name"] = f"node {index}"
+            node["translation"] = generator.normal(size=3).tolist()
+            node["rotation"] = (quaternion / np.linalg.norm(quaternion)).tolist()
+            node["scale"] = generator.uniform(0.5, 2, size=3).tolist()
+        path = write(tmp_path, "tree.glb", glb_bytes(*gltf_document(nodes=nodes)))
+        mesh, scene = load_mesh(path), trimesh.load_scene(path, process=False)
+        assert sorted(part.name for part in mesh.parts) == sorted(scene.graph.nodes_geometry)
+        for part in mesh.parts:
+            matrix, geometry = scene.graph[part.name]
+            expected = scene.geometry[geometry].vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            found = mesh.vertices[part.first_vertex : part.first_vertex + part.num_vertices]
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+
+    @pytest.mark.parametrize("form", ["stl", "stl_ascii"])
+    def test_stl_agrees_with_a_second_writer(self, tmp_path, form):
+        sphere = trimesh.creation.icosphere(subdivisions=2)
+        data = sphere.export(file_type=form)
+        mesh = load_mesh(write(tmp_path, "sphere.stl", data))
+        corners = sphere.vertices[sphere.faces].reshape(-1, 3)
+        np.testing.assert_allclose(mesh.vertices, corners, atol=1e-7)
+
+    def test_ascii_stl_of_several_solids_is_not_welded(self, tmp_path):
+        facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+        solid = "solid vertex\n" + 2 * (facet + "endloop\nendfacet\n") + "endsolid vertex\n"
+        mesh = load_mesh(write(tmp_path, "two.stl", solid * 2))
+        assert mesh.num_points == 12
+        assert mesh.num_faces == 4
+
     def test_vertex_colours_are_decoded_from_srgb(self, tmp_path):
         text = ply_bytes(polygons=CUBE_QUADS.tolist()).decode()
         text = text.replace(
@@ -478,6 +575,11 @@ BAD_FILES = {
     "cut.stl": (stl_bytes(CUBE_VERTICES[CUBE_FACES])[:-1], "claims 12 triangles.* 684 .* 683"),
     "many.stl": (stl_bytes([], count=2**32 - 1), "claims 4294967295 triangles"),
     "cut_ascii.stl": ("solid x\nfacet\nouter loop\nvertex 0 0 0\n", "endsolid is missing"),
+    "cut_solid.stl": (
+        "solid x\nendsolid\nsolid y\n" + "vertex 0 0 0\n" * 99,
+        "endsolid is missing",
+    ),
+    "moved.stl": ("solid x\nvertex 0 0\nvertex 0 1 1 1\nvertex 1 2 3\nendsolid\n", "line 2"),
     "words.stl": ("solid x\nvertex 0 0 a\nendsolid\n", "line 2"),
     "cut.glb": (glb_bytes(GLTF, GLTF_BINARY)[:-9], "truncated"),
     "chunk.glb": (glb_bytes(GLTF, GLTF_BINARY, length=660), "chunk b'.*' claims"),
@@ -485,6 +587,8 @@ BAD_FILES = {
     "list.gltf": ("[]", "not a valid glTF"),
     "cloud.glb": (changed(["meshes", 0, "primitives", 0, "mode"], 0), "no vertices"),
     "strip.glb": (changed(["meshes", 0, "primitives", 0, "mode"], 5), "strips"),
+    "fan.glb": (changed(["meshes", 0, "primitives", 0, "mode"], 6), "fans"),
+    "parents.glb": (changed(["scenes", 0, "nodes"], [0, 0]), "two parents"),
     "negative_node.glb": (changed(["scenes", 0, "nodes"], [-1]), r"nodes\[-1\]"),
     "negative_accessor.glb": (
         changed(["meshes", 0, "primitives", 0, "indices"], -1),

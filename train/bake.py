@@ -18,7 +18,7 @@ CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 @main
 def bake(arguments: list[str]) -> None:
     """Bake every point of the command line's grid."""
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)
     for config in parse_command_line(
         arguments, CONFIGS, default_name="fit", script="train/bake.py"
     ):

@@ -18,7 +18,7 @@ CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 @main
 def fit(arguments: list[str]) -> None:
     """Run every point of the command line's grid."""
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)
     for config in parse_command_line(arguments, CONFIGS, default_name="fit", script="train/fit.py"):
         execute(config, console)
 

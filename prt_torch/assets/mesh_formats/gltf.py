@@ -136,7 +136,9 @@ def _local_transform(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     """A node's matrix, or its translation, rotation (a quaternion x, y, z, w) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    quaternion = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    # Writers round it, and a length other than 1 would be a scale.
+    x, y, z, w = quaternion / max(np.linalg.norm(quaternion), np.finfo(np.float64).tiny)
     rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
