@@ -46,7 +46,7 @@ ORDERS = (6, 10)
 @main
 def benchmark(arguments: list[str]) -> None:
     """Run all benchmarks."""
-    mesh, quick = procedural_scene("torus_knot"), False
+    mesh, quick = procedural_scene(detail=2), False
     for argument in arguments:
         match argument.partition("="):
             case ("--mesh", "=", path):

@@ -282,12 +282,12 @@ class Sharded:
     """
 
     tensors: Mapping[str, ShardedTensor | Tensor]
-    counts: dict[str, float]
+    counts: dict[str, int | float]
     cached: bool
 
 
 def build_sharded(
-    make: Callable[[slice], tuple[dict[str, Tensor], dict[str, float]]],
+    make: Callable[[slice], tuple[dict[str, Tensor], dict[str, int | float]]],
     *,
     rows: int,
     rows_per_shard: int,
@@ -339,7 +339,7 @@ def build_sharded(
     return Sharded(sharded, counts, cached)
 
 
-def _sum_counts(counts: list[dict[str, float]]) -> dict[str, float]:
+def _sum_counts(counts: list[dict[str, int | float]]) -> dict[str, int | float]:
     return {name: sum(some[name] for some in counts) for name in counts[0]}
 
 

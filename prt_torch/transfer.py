@@ -7,7 +7,7 @@ mesh: :meth:`TransferTensor.from_dense` takes any array.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from torch import Tensor
 from prt_torch.bases import Diffuse, ExitBasis, LightBasis, Rowwise
 
 
+@runtime_checkable
 class Rows(Protocol):
     """Values read by slices of points: a tensor in memory, or shards on disk."""
 

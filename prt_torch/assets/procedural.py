@@ -93,7 +93,7 @@ def _knot_albedo(
     return base + 0.35 * stripe**2 * (light - base)
 
 
-def _torus_knot(num_along: int = 200, num_around: int = 24) -> Mesh:
+def _torus_knot(num_along: int, num_around: int) -> Mesh:
     """A tube around the (2, 3) torus knot, its axis upright.
 
     The curve winds on a torus, whose normal is perpendicular to it everywhere and closes up after
@@ -130,23 +130,30 @@ def _torus_knot(num_along: int = 200, num_around: int = 24) -> Mesh:
     )
 
 
-def _knot_on_ground() -> Mesh:
-    knot = _torus_knot()
-    return concatenate([knot, ground_plane(knot, size=3.0)], "torus_knot")
+def _knot_on_ground(detail: int) -> Mesh:
+    knot = _torus_knot(200 * detail, 24 * detail)
+    ground = ground_plane(knot, size=3.0, resolution=48 * detail)
+    return concatenate([knot, ground], "torus_knot")
 
 
-_SCENES: dict[str, Callable[[], Mesh]] = {"torus_knot": _knot_on_ground}
+_SCENES: dict[str, Callable[[int], Mesh]] = {"torus_knot": _knot_on_ground}
 
 
-def procedural_scene(name: str = "torus_knot") -> Mesh:
+def procedural_scene(name: str = "torus_knot", *, detail: int = 1) -> Mesh:
     """A scene made of formulas, the same on every machine.
 
     ``torus_knot`` is a knotted tube with coloured bands over a grey ground: closed, shadowing
     itself, 7,104 points.
 
+    Args:
+        name: Which scene.
+        detail: Points along every edge, as a multiple; at 2 there are four times as many points.
+
     Raises:
-        InputError: If there is no scene of that name.
+        InputError: If there is no scene of that name, or the detail is below 1.
     """
     if name not in _SCENES:
         raise InputError(f"scene {name!r} is unknown, expected one of {', '.join(_SCENES)}")
-    return _SCENES[name]()
+    if detail < 1:
+        raise InputError(f"detail={detail}: expected at least 1")
+    return _SCENES[name](detail)

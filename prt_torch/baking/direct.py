@@ -66,7 +66,7 @@ def project_diffuse(
     per_solid_angle = (1.0 / solid_angles).float()
     normals = mesh.normals.to(torch.float32)
 
-    def project(rows: slice) -> tuple[dict[str, Tensor], dict[str, float]]:
+    def project(rows: slice) -> tuple[dict[str, Tensor], dict[str, int | float]]:
         start = time.perf_counter()
         values, squared_norms = [], []
         for first in range(rows.start, rows.stop, at_once):

@@ -152,7 +152,7 @@ def trace_visibility(
     texels = 6 * fine * fine
     tracer: list[Tracer] = []
 
-    def trace(rows: slice) -> tuple[dict[str, Tensor], dict[str, float]]:
+    def trace(rows: slice) -> tuple[dict[str, Tensor], dict[str, int | float]]:
         start = time.perf_counter()
         if not tracer:  # built only when there is something to trace
             tracer.append(Tracer(mesh, fine))

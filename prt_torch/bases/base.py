@@ -7,13 +7,14 @@ inner products with them. Where the basis is not orthonormal, norms go through :
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
+@runtime_checkable
 class Radiance(Protocol):
     """Distant light that can be integrated: an environment map, or anything like one."""
 

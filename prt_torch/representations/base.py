@@ -60,7 +60,7 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def forward(
-        self, light: Float[Tensor, "batch coeffs rgb"], frames: Tensor | None = None
+        self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
     ) -> Float[Tensor, "batch points rows rgb"]:
         """Radiance in the exit basis, before reflectance, for a batch of lights.
 

@@ -119,7 +119,7 @@ class CPCA(Representation):
         return self.representatives.shape[1] - 1
 
     def forward(
-        self, light: Float[Tensor, "batch coeffs rgb"], frames: Tensor | None = None
+        self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
     ) -> Float[Tensor, "batch points rows rgb"]:
         """Light the representatives, then mix them for each point.
 

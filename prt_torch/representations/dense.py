@@ -38,7 +38,7 @@ class DenseTransfer(Representation):
         return cls(transfer.dense().clone(), transfer.surface)
 
     def forward(
-        self, light: Float[Tensor, "batch coeffs rgb"], frames: Tensor | None = None
+        self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
     ) -> Float[Tensor, "batch points rows rgb"]:
         """Transfer times light.
 

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 _BUCKET_COST = 1500  # slots of padding that are worth one batched product less
@@ -100,12 +100,12 @@ class ClusterBlocks(nn.Module):
         self.register_buffer("filled", filled, persistent=False)
         self.register_buffer("cluster_of_slot", cluster_of_slot.to(labels.device), persistent=False)
 
-    def to_slots(self, values: Float[Tensor, "points *rest"]) -> Float[Tensor, "slots *rest"]:
+    def to_slots(self, values: Shaped[Tensor, "points *rest"]) -> Shaped[Tensor, "slots *rest"]:
         """Sort values by cluster; padding is zero."""
         shape = (self.num_slots,) + (1,) * (values.ndim - 1)
         return values.index_select(0, self.point_of_slot) * self.filled.view(shape).to(values)
 
-    def to_points(self, values: Float[Tensor, "slots *rest"]) -> Float[Tensor, "points *rest"]:
+    def to_points(self, values: Shaped[Tensor, "slots *rest"]) -> Shaped[Tensor, "points *rest"]:
         """Back to the order of the points, without the padding."""
         return values.index_select(0, self.slot_of_point)
 
