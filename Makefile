@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-all lint bench clean
+.PHONY: demo test test-all test-types lint bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -19,6 +19,12 @@ test: $(INSTALLED)
 
 test-all: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 -m ''
+
+# Shape annotations checked at run time, on the tests that pass tensors about.
+test-types: $(INSTALLED)
+	$(BIN)/python -m pytest -n 2 --jaxtyping-packages=prt_torch,beartype.beartype \
+	  tests/test_sphere.py tests/test_sh.py tests/test_baking.py tests/test_cpca.py \
+	  tests/test_fitting.py tests/test_relight.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff format --check .

@@ -5,6 +5,7 @@ python eval/report.py RUN... [--out=FOLDER]
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -30,7 +31,9 @@ def report(arguments: list[str]) -> None:
             raise InputError(f"{argument}: unknown option; {USAGE}")
         else:
             runs.append(Path(argument))
-    reports = [store.read_json(run / "report.json") for run in runs]
+    if not runs or len({run.resolve() for run in runs}) < len(runs):
+        raise InputError(f"expected one or more different run folders, got {len(runs)}; {USAGE}")
+    reports = [_read(run / "report.json") for run in runs]
     gathered = gather(reports, names=[str(run) for run in runs])
     with store.locked(out, what="output folder"):
         store.write_json(out / "report.json", gathered)
@@ -38,6 +41,19 @@ def report(arguments: list[str]) -> None:
     console = Console(width=None if sys.stdout.isatty() else 140)
     console.print(summary_table(gathered))
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The report of a run.
+
+    Raises:
+        InputError: If it is missing or is not one.
+    """
+    content = store.read_json(path)
+    parts = ("scene", "light", "bake", "raw_bytes", "left_out", "results")
+    if not isinstance(content, dict) or any(part not in content for part in parts):
+        raise InputError(f"{path}: not the report of a run; expected the keys {', '.join(parts)}")
+    return content
 
 
 if __name__ == "__main__":

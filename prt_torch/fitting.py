@@ -75,7 +75,7 @@ def fit(
         optimizer: ``lbfgs`` (strong Wolfe line search, four iterations a step) or ``adam``.
         max_steps: Steps at most; 0 only measures.
         learning_rate: First step length of L-BFGS (default 1) or rate of Adam (default 1e-3 times
-            the root mean square of each parameter).
+            the median magnitude of each parameter).
         tolerance: A step that lowers the error by less than this share of it ends the fit.
         metric: What errors are worth; the L2 norm over light directions if not given.
         checkpoint: File to resume from if it exists, and to write after every step.
@@ -152,7 +152,7 @@ class _Run:
             case "adam":
                 rate = 1e-3 if learning_rate is None else learning_rate
                 groups = [
-                    {"params": [p], "lr": rate * (1.0 if learning_rate else _root_mean_square(p))}
+                    {"params": [p], "lr": rate * (1.0 if learning_rate else _typical_size(p))}
                     for p in self.parameters.values()
                 ]
                 self.optimizer = torch.optim.Adam(groups)
@@ -251,8 +251,10 @@ def _digest(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
     return store.digest(header, *(part for item in sorted(tensors.items()) for part in item))
 
 
-def _root_mean_square(parameter: Tensor) -> float:
-    return float(parameter.detach().double().square().mean().sqrt()) or 1.0
+def _typical_size(parameter: Tensor) -> float:
+    """Median magnitude, or the root mean square where more than half of the values are zero."""
+    values = parameter.detach().double()
+    return float(values.abs().median()) or float(values.square().mean().sqrt()) or 1.0
 
 
 def _flatten(value: Any, tensors: dict[str, Tensor], path: str) -> Any:

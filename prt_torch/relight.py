@@ -81,7 +81,10 @@ class Relighter(nn.Module):
             radiance = radiance[:, None, :, 0]
         else:
             radiance = torch.einsum("bprc,vpr->bvpc", radiance, rows)
-        return radiance if shared else radiance * reflectance
+        if shared:
+            return radiance
+        tracked = torch.is_grad_enabled() and (radiance.requires_grad or reflectance.requires_grad)
+        return radiance * reflectance if tracked else radiance.mul_(reflectance)
 
     def _view_rows(
         self, views: Tensor | None, frames: Tensor | None

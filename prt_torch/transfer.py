@@ -52,7 +52,9 @@ class Surface:
 
     exit_basis: ExitBasis = field(default_factory=Diffuse)
     light_basis: LightBasis | None = None
-    reflectance: Float[Tensor, "points rgb"] = field(default_factory=lambda: torch.ones(1, 3))
+    reflectance: Float[Tensor, "points_or_one rgb"] = field(
+        default_factory=lambda: torch.ones(1, 3)
+    )
     frames: Float[Tensor, "points 3 3"] | None = None
     positions: Float[Tensor, "points 3"] | None = None
 

@@ -139,7 +139,7 @@ class Contract(ABC):
         header = int.from_bytes(path.read_bytes()[:8], "little")
         assert sum(representation.storage().values()) == path.stat().st_size - 8 - header
 
-    def test_wrong_light_is_refused(self):
+    def test_wrong_light_is_refused(self, without_type_checker):
         representation = self.make(random_transfer())
         for shape in [(9, 3), (1, 8, 3), (1, 9, 1), (1, 59, 9, 3)]:
             with pytest.raises(ValueError, match="expected light"):

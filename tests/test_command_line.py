@@ -574,7 +574,8 @@ class TestOutputFolder:
 
     @staticmethod
     def reported(name: str) -> Path:
-        store.write_json(Path(name) / "report.json", {"results": []})
+        parts = ("scene", "light", "bake", "raw_bytes", "left_out", "results")
+        store.write_json(Path(name) / "report.json", dict.fromkeys(parts, []))
         return Path(name)
 
 
@@ -584,6 +585,16 @@ class TestReport:
         Path("run").mkdir()
         write("run/report.json", content)
         refuse(capfd, REPORT, ["run", "--out=all"], "run/report.json", "not a JSON file")
+
+    @pytest.mark.parametrize("content", [b"{}", b"[]", b'{"results": []}'])
+    def test_json_that_is_no_report(self, capfd, content):
+        Path("run").mkdir()
+        write("run/report.json", content)
+        refuse(capfd, REPORT, ["run", "--out=all"], "run/report.json", "not the report of a run")
+
+    def test_no_run_or_the_same_run_twice(self, capfd):
+        for runs in ([], ["run", "./run"]):
+            refuse(capfd, REPORT, [*runs, "--out=all"], "different run folders", f"{len(runs)}")
 
     def test_missing_report(self, capfd):
         Path("run").mkdir()

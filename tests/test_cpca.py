@@ -192,6 +192,6 @@ def test_wide_points_are_projected_without_losing_the_fit():
         ({"method": "magic"}, "iterative or static"),
     ],
 )
-def test_bad_budgets(options, message):
+def test_bad_budgets(options, message, without_type_checker):
     with pytest.raises(ValueError, match=message):
         CPCA.from_transfer(random_transfer(), **options)

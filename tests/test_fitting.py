@@ -128,7 +128,7 @@ def test_interruption_keeps_the_best():
     assert measured(model, transfer) < before
 
 
-def test_wrong_arguments():
+def test_wrong_arguments(without_type_checker):
     transfer = random_transfer()
     model = CPCA.from_transfer(transfer, num_clusters=2, rank=1)
     with pytest.raises(ValueError, match="shape"):

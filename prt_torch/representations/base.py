@@ -64,6 +64,8 @@ class Representation(nn.Module, ABC):
     ) -> Float[Tensor, "batch points rows rgb"]:
         """Radiance in the exit basis, before reflectance, for a batch of lights.
 
+        The result is a new tensor; its strides are free.
+
         Args:
             light: Light coefficients ``"batch coeffs rgb"``, or ``"batch points coeffs rgb"``
                 where each point has its own light.

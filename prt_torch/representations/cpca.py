@@ -29,7 +29,8 @@ class CPCA(Representation):
     """Clustered affine subspaces of transfer.
 
     Parameters are ``representatives`` ``"clusters rank+1 channels rows coeffs"``, the mean first,
-    and ``weights`` ``"points rank"``. The vectors come orthonormal (in the
+    and ``mixture`` ``"points rank+1"``: a 1 for the mean, which no gradient reaches, then the
+    weights. The vectors come orthonormal (in the
     metric) from the closed form and are free afterwards: any invertible mixture of them with the
     inverse mixture of the weights is the same transfer, so a constraint would only slow a fit.
 
@@ -52,7 +53,9 @@ class CPCA(Representation):
         self.representatives = nn.Parameter(
             encoding.representatives.unflatten(-1, shape[1:]).contiguous()
         )
-        self.weights = nn.Parameter(encoding.weights.clone())
+        # The ones are kept beside the weights because evaluation wants them so, and to put them
+        # there would cost it a third of its time.
+        self.mixture = nn.Parameter(nn.functional.pad(encoding.weights, (1, 0), value=1.0))
         self.register_buffer("labels", encoding.labels)
         vectors = self.rank + 1
         steps = torch.arange(vectors, device=encoding.labels.device)
@@ -118,6 +121,11 @@ class CPCA(Representation):
         """Vectors a cluster beside its mean."""
         return self.representatives.shape[1] - 1
 
+    @property
+    def weights(self) -> Float[Tensor, "points rank"]:
+        """Weights of each point; a view of ``mixture`` without the ones."""
+        return self.mixture[:, 1:]
+
     def forward(
         self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
     ) -> Float[Tensor, "batch points rows rgb"]:
@@ -131,10 +139,10 @@ class CPCA(Representation):
             raise ValueError("CPCA stores transfer in the rest pose and cannot be posed by frames")
         if self._check_light(light):
             return self._forward_local(light)
-        lit = self._light_representatives(light)  # clusters, rank+1, rows * batch * rgb
-        wants_grad = lit.requires_grad or self.weights.requires_grad
+        lit = self._light_representatives(light)  # clusters, rank+1, rows * rgb * batch
+        wants_grad = lit.requires_grad or self.mixture.requires_grad
         mix = self._mix_grouped if torch.is_grad_enabled() and wants_grad else self._mix_gathered
-        return mix(lit).view(self.num_points, self.num_rows, -1, 3).permute(2, 0, 1, 3)
+        return mix(lit).view(self.num_points, self.num_rows, 3, -1).permute(3, 0, 1, 2)
 
     def _mix_grouped(self, vectors: Tensor) -> Float[Tensor, "points values"]:
         """Weighted sums of each point's own vectors, by batched products: fast to differentiate."""
@@ -147,24 +155,23 @@ class CPCA(Representation):
 
         The lit vectors of all clusters stay in the processor's cache.
         """
-        mixture = torch.cat([torch.ones_like(self.weights[:, :1]), self.weights], dim=1)
         return nn.functional.embedding_bag(
             self._own_vectors,
             vectors.flatten(0, 1),
             self._own_borders,
             mode="sum",
-            per_sample_weights=mixture.flatten(),
+            per_sample_weights=self.mixture.flatten(),
             include_last_offset=True,
         )
 
     def _light_representatives(self, light: Tensor) -> Tensor:
         clusters, vectors, channels, _, coeffs = self.representatives.shape
         if channels == 1:
-            columns = light.permute(1, 0, 2).reshape(coeffs, -1)
+            columns = light.permute(1, 2, 0).reshape(coeffs, -1)
             lit = self.representatives.view(-1, coeffs) @ columns
         else:
             by_channel = self.representatives.permute(2, 0, 1, 3, 4).reshape(channels, -1, coeffs)
-            lit = torch.bmm(by_channel, light.permute(2, 1, 0)).permute(1, 2, 0)
+            lit = torch.bmm(by_channel, light.permute(2, 1, 0)).permute(1, 0, 2)
         return lit.reshape(clusters, vectors, -1)
 
     def _forward_local(self, light: Tensor) -> Tensor:

@@ -52,9 +52,9 @@ class DenseTransfer(Representation):
             return torch.einsum(equation, self.values, light)
         if self.num_channels == 3:
             return torch.einsum("pcri,bic->bprc", self.values, light)
-        columns = light.permute(1, 0, 2).reshape(self.num_coeffs, -1)
+        columns = light.permute(1, 2, 0).reshape(self.num_coeffs, -1)
         lit = self.values.view(-1, self.num_coeffs) @ columns
-        return lit.view(self.num_points, self.num_rows, -1, 3).permute(2, 0, 1, 3)
+        return lit.view(self.num_points, self.num_rows, 3, -1).permute(3, 0, 1, 2)
 
     def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
         """The values."""
