@@ -575,7 +575,7 @@ class TestOutputFolder:
     @staticmethod
     def reported(name: str) -> Path:
         parts = ("scene", "light", "bake", "raw_bytes", "left_out", "results")
-        store.write_json(Path(name) / "report.json", dict.fromkeys(parts, []))
+        store.write_json(Path(name) / "report.json", {key: [] for key in parts})
         return Path(name)
 
 
