@@ -38,7 +38,9 @@ Albedo = tuple[
 class SceneConfig(_Section):
     """What is lit."""
 
-    mesh: str | None = Field(None, description="mesh file; null is the embedded procedural scene")
+    mesh: str | None = Field(
+        None, min_length=1, description="mesh file; null is the embedded procedural scene"
+    )
     ground: bool = Field(True, description="put a mesh file on a ground plane")
     ground_size: float = Field(4.0, gt=0, description="its edge, in horizontal extents of the mesh")
     ground_resolution: int = Field(48, ge=2, le=2048, description="points along its edge")

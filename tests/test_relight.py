@@ -141,7 +141,7 @@ def test_works_compiled(without_type_checker):
     compiled = torch.compile(relight, backend="aot_eager")
     assert relative(compiled(light), relight(light)) < 1e-5
     compiled(light).sum().backward()
-    assert torch.isfinite(relight.representation.mixture.grad).all()
+    assert torch.isfinite(relight.representation.weights.grad).all()
 
 
 def test_transfer_error_counts_in_the_norm_of_the_light_basis():

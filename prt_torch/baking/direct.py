@@ -26,6 +26,7 @@ from prt_torch.transfer import Surface, TransferTensor
 _BYTES_PER_TEXEL = 16  # bits as bytes and as floats, and weighted cosines, at their peak
 _POINTS_AT_ONCE = 32  # their texels stay in the processor's cache
 _POINTS_PER_SHARD = 4096
+_ALGORITHM = 1  # raise it when the same inputs would give other values
 
 
 def project_diffuse(
@@ -86,6 +87,7 @@ def project_diffuse(
         "normals": store.digest(mesh.normals),
         "light_basis": light_basis.describe(),
         "material": "diffuse",
+        "algorithm": _ALGORITHM,
     }
     built = store.build_sharded(
         project,

@@ -31,6 +31,7 @@ Progress = Callable[[int, int], None]
 """Told of points done and points in all."""
 
 _RAY_OFFSET = 4e-6  # of the unit box, along the normal
+_ALGORITHM = 1  # raise it when the same inputs would give other bits, so that caches are not reused
 _FREE = -1  # embreex marks a ray that hits nothing with -1, and with 0 one that is occluded
 _BITS_PER_SHARD = 2**26
 
@@ -165,6 +166,7 @@ def trace_visibility(
         "normals": store.digest(mesh.normals),
         "texels_per_edge": fine,
         "ray_offset": _RAY_OFFSET,
+        "algorithm": _ALGORITHM,
     }
     built = store.build_sharded(
         trace,

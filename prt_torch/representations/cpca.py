@@ -29,8 +29,7 @@ class CPCA(Representation):
     """Clustered affine subspaces of transfer.
 
     Parameters are ``representatives`` ``"clusters rank+1 channels rows coeffs"``, the mean first,
-    and ``mixture`` ``"points rank+1"``: a 1 for the mean, which no gradient reaches, then the
-    weights. The vectors come orthonormal (in the
+    and ``weights`` ``"points rank"``. The vectors come orthonormal (in the
     metric) from the closed form and are free afterwards: any invertible mixture of them with the
     inverse mixture of the weights is the same transfer, so a constraint would only slow a fit.
 
@@ -53,9 +52,7 @@ class CPCA(Representation):
         self.representatives = nn.Parameter(
             encoding.representatives.unflatten(-1, shape[1:]).contiguous()
         )
-        # The ones are kept beside the weights because evaluation wants them so, and to put them
-        # there would cost it a third of its time.
-        self.mixture = nn.Parameter(nn.functional.pad(encoding.weights, (1, 0), value=1.0))
+        self.weights = nn.Parameter(encoding.weights.clone())
         self.register_buffer("labels", encoding.labels)
         vectors = self.rank + 1
         steps = torch.arange(vectors, device=encoding.labels.device)
@@ -121,11 +118,6 @@ class CPCA(Representation):
         """Vectors a cluster beside its mean."""
         return self.representatives.shape[1] - 1
 
-    @property
-    def weights(self) -> Float[Tensor, "points rank"]:
-        """Weights of each point; a view of ``mixture`` without the ones."""
-        return self.mixture[:, 1:]
-
     def forward(
         self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
     ) -> Float[Tensor, "batch points rows rgb"]:
@@ -140,7 +132,7 @@ class CPCA(Representation):
         if self._check_light(light):
             return self._forward_local(light)
         lit = self._light_representatives(light)  # clusters, rank+1, rows * rgb * batch
-        wants_grad = lit.requires_grad or self.mixture.requires_grad
+        wants_grad = lit.requires_grad or self.weights.requires_grad
         mix = self._mix_grouped if torch.is_grad_enabled() and wants_grad else self._mix_gathered
         return mix(lit).view(self.num_points, self.num_rows, 3, -1).permute(3, 0, 1, 2)
 
@@ -155,12 +147,13 @@ class CPCA(Representation):
 
         The lit vectors of all clusters stay in the processor's cache.
         """
+        mixture = nn.functional.pad(self.weights, (1, 0), value=1.0)
         return nn.functional.embedding_bag(
             self._own_vectors,
             vectors.flatten(0, 1),
             self._own_borders,
             mode="sum",
-            per_sample_weights=self.mixture.flatten(),
+            per_sample_weights=mixture.flatten(),
             include_last_offset=True,
         )
 
@@ -176,8 +169,7 @@ class CPCA(Representation):
 
     def _forward_local(self, light: Tensor) -> Tensor:
         """Each point's own light meets its cluster's representatives, then its weights."""
-        ones = torch.ones_like(self.weights[:, :1])
-        mixture = self.blocks.to_slots(torch.cat([ones, self.weights], dim=1))
+        mixture = self.blocks.to_slots(nn.functional.pad(self.weights, (1, 0), value=1.0))
         by_point = self.blocks.to_slots(light.permute(1, 3, 0, 2))  # slots rgb batch coeffs
         colours = []
         for colour in range(3):

@@ -10,6 +10,8 @@ from prt_torch.metric import Metric
 from prt_torch.representations.base import Representation
 from prt_torch.transfer import Surface, TransferTensor
 
+_MANY_LIGHTS = 4  # below it the product is up to three times faster with the lights as its rows
+
 
 class DenseTransfer(Representation):
     """Transfer as it was baked, one matrix product a light.
@@ -52,8 +54,11 @@ class DenseTransfer(Representation):
             return torch.einsum(equation, self.values, light)
         if self.num_channels == 3:
             return torch.einsum("pcri,bic->bprc", self.values, light)
-        columns = light.permute(1, 2, 0).reshape(self.num_coeffs, -1)
-        lit = self.values.view(-1, self.num_coeffs) @ columns
+        matrix = self.values.view(-1, self.num_coeffs)
+        if len(light) < _MANY_LIGHTS:
+            lit = light.permute(2, 0, 1).reshape(-1, self.num_coeffs) @ matrix.mT
+            return lit.view(3, -1, self.num_points, self.num_rows).permute(1, 2, 3, 0)
+        lit = matrix @ light.permute(1, 2, 0).reshape(self.num_coeffs, -1)
         return lit.view(self.num_points, self.num_rows, 3, -1).permute(3, 0, 1, 2)
 
     def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
