@@ -43,7 +43,7 @@ class Relighter(nn.Module):
     def forward(
         self,
         light: Tensor | Radiance | Sequence[Radiance],
-        views: Float[Tensor, "views 3"] | None = None,
+        views: Float[Tensor, "views *points 3"] | None = None,
         frames: Float[Tensor, "points 3 3"] | None = None,
     ) -> Float[Tensor, "batch views points rgb"]:
         """Outgoing radiance.
