@@ -16,6 +16,7 @@ from prt_torch.report import write_html
 from prt_torch.representations import DenseTransfer, Representation
 from prt_torch.transfer import TransferTensor
 
+PICTURES = "pictures"  # folder of them inside a run folder
 _DENSE_BLOCK_POINTS = 2000  # timed and scaled up when the whole tensor does not fit
 
 
@@ -63,7 +64,7 @@ def write_report(
     norms = transfer.squared_norm()
     scale = float(norms.mean()) or 1.0
     pictures, opengl_drew = gallery.draw(
-        out / "pictures",
+        out / PICTURES,
         inputs.mesh,
         lit,
         {name: (squared / scale).sqrt() for name, squared in errors.items()},

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from prt_torch import store
-from prt_torch.account import Fitted, Inputs, write_report
+from prt_torch.account import PICTURES, Fitted, Inputs, write_report
 from prt_torch.assets import (
     Environment,
     Mesh,
@@ -36,7 +36,7 @@ from prt_torch.report import summary_table
 from prt_torch.representations import CPCA, load, save
 from prt_torch.transfer import TransferTensor
 
-CONFIG, RESULTS, PICTURES = "config.yaml", "results", "pictures"
+CONFIG, RESULTS = "config.yaml", "results"
 
 
 def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]:
