@@ -2,19 +2,19 @@
 
 A metric turns transfer values into a space where plain sums of squares are the errors that count.
 Representations are built in that space without knowing which metric it is, and their results are
-turned back. The default is the L2 norm over the sphere of light directions, which the light
-basis' Gram matrix gives, so fits in different bases answer the same question. A *light prior*
-weighs errors by the light that is expected: then the squared norm of a transfer error is its
-expected squared radiance error.
+turned back. The default is the L2 norm over the sphere of light directions, averaged over the
+hemisphere of views, which the Gram matrices of the two bases give, so fits in different bases
+answer the same question. A *light prior* weighs errors by the light that is expected: then the
+squared norm of a transfer error is its expected squared radiance error.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from prt_torch.bases import LightBasis
+from prt_torch.bases import Diffuse, ExitBasis, LightBasis
 from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
@@ -23,25 +23,31 @@ _MAX_PRIOR_COEFFS = 2048  # its matrix has the square of it
 
 @dataclass(frozen=True)
 class Metric:
-    """Squared error as the squared norm of ``difference @ factor``.
+    """Squared error as the squared norm of ``row_factor.T @ difference @ factor``.
 
     Attributes:
         name: ``l2`` or ``light_prior``.
         factor: ``"coeffs"`` for a diagonal, or ``"coeffs coeffs"``; invertible, float64.
+        row_factor: ``"rows rows"`` lower triangular, float64: Cholesky factor of the exit basis'
+            Gram matrix.
     """
 
     name: str
     factor: Float[Tensor, "coeffs"] | Float[Tensor, "coeffs coeffs"]
+    row_factor: Float[Tensor, "rows rows"] = field(
+        default_factory=lambda: torch.ones(1, 1, dtype=torch.float64)
+    )
 
     @classmethod
     def l2(cls, transfer: TransferTensor) -> "Metric":
-        """The L2 norm over the sphere of light directions."""
+        """The L2 norm over the sphere of light directions, averaged over views."""
         basis = transfer.surface.light_basis
+        row_factor = torch.linalg.cholesky(transfer.surface.exit_basis.gram())
         if basis is None:
-            return cls("l2", torch.ones(transfer.num_coeffs, dtype=torch.float64))
+            return cls("l2", torch.ones(transfer.num_coeffs, dtype=torch.float64), row_factor)
         gram = basis.gram()
         factor = gram.sqrt() if gram.ndim == 1 else torch.linalg.cholesky(gram)
-        return cls("l2", factor)
+        return cls("l2", factor, row_factor)
 
     @classmethod
     def light_prior(
@@ -49,6 +55,7 @@ class Metric:
         lights: Float[Tensor, "lights coeffs rgb"],
         light_basis: LightBasis,
         *,
+        exit_basis: ExitBasis | None = None,
         turns: int = 16,
         floor: float = 1e-3,
     ) -> "Metric":
@@ -57,6 +64,7 @@ class Metric:
         Args:
             lights: Light coefficients; each is scaled to the same power first.
             light_basis: Their basis.
+            exit_basis: The basis of the transfer's rows; diffuse if not given.
             turns: Equal steps about +y that each light is taken at.
             floor: Share of the mean power that every direction of light space keeps, so that
                 lights unlike these still count. It bounds the condition of the metric.
@@ -79,16 +87,22 @@ class Metric:
             moment += unit @ unit.mT
         moment = moment * (coeffs / moment.trace().clamp_min(torch.finfo(torch.float64).tiny))
         moment = moment + floor * torch.eye(coeffs, dtype=torch.float64)
-        return cls("light_prior", torch.linalg.cholesky(moment))
+        rows = (exit_basis or Diffuse()).gram()
+        return cls("light_prior", torch.linalg.cholesky(moment), torch.linalg.cholesky(rows))
 
-    def weigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+    def weigh(self, values: Float[Tensor, "... rows coeffs"]) -> Float[Tensor, "... rows coeffs"]:
         """Into the space where errors are sums of squares."""
         factor = self.factor.to(values)
+        if len(self.row_factor) > 1:
+            values = self.row_factor.mT.to(values) @ values
         return values * factor if factor.ndim == 1 else values @ factor
 
-    def unweigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+    def unweigh(self, values: Float[Tensor, "... rows coeffs"]) -> Float[Tensor, "... rows coeffs"]:
         """Back from it."""
         factor = self.factor.to(values)
+        if len(self.row_factor) > 1:
+            upper = self.row_factor.mT.to(values)
+            values = torch.linalg.solve_triangular(upper, values, upper=True)
         if factor.ndim == 1:
             return values / factor
         return torch.linalg.solve_triangular(factor, values, upper=False, left=False)

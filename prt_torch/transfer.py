@@ -183,14 +183,20 @@ class TransferTensor:
             yield rows, self.values[rows]
 
     def squared_norm(self) -> Float[Tensor, "points"]:
-        """Squared L2 norm of each point's transfer over the sphere, summed over rows, float64."""
+        """Squared L2 norm of each point's transfer, float64.
+
+        Over the sphere of light directions, averaged over the hemisphere of views, summed over
+        channels.
+        """
         return torch.cat([self.squared_norm_of(values) for _, values in self.blocks()])
 
     def squared_norm_of(
         self, values: Float[Tensor, "points channels rows coeffs"]
     ) -> Float[Tensor, "points"]:
         """Squared norm in this tensor's light basis of other values, such as a difference."""
-        basis = self.surface.light_basis
+        basis, values = self.surface.light_basis, values.to(torch.float64)
+        if self.num_rows > 1:
+            values = torch.linalg.cholesky(self.surface.exit_basis.gram()).mT.to(values) @ values
         if basis is None:
-            return values.to(torch.float64).square().sum((1, 2, 3))
+            return values.square().sum((1, 2, 3))
         return basis.squared_norm(values).sum((1, 2))

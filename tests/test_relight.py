@@ -23,6 +23,9 @@ class Linear(ExitBasis):
     def evaluate(self, view):
         return torch.cat([torch.ones_like(view[..., :1]), view], dim=-1)
 
+    def gram(self):
+        return torch.diag(torch.tensor([1.0, 1 / 3, 1 / 3, 1 / 3], dtype=torch.float64))
+
     def describe(self):
         return {"name": "linear"}
 

@@ -5,7 +5,7 @@ from typing import Any
 from prt_torch.bases import sh
 from prt_torch.bases.base import ExitBasis, LightBasis, Radiance
 from prt_torch.bases.cube import CubeDirections
-from prt_torch.bases.exit import Diffuse, Rowwise
+from prt_torch.bases.exit import Diffuse, HemisphericalHarmonics, Rowwise
 from prt_torch.bases.sh import SphericalHarmonics
 from prt_torch.errors import InputError
 
@@ -13,6 +13,7 @@ __all__ = [
     "CubeDirections",
     "Diffuse",
     "ExitBasis",
+    "HemisphericalHarmonics",
     "LightBasis",
     "Radiance",
     "Rowwise",
@@ -39,7 +40,11 @@ def exit_basis(description: dict[str, Any]) -> ExitBasis:
     match description:
         case {"name": "diffuse"}:
             return Diffuse()
+        case {"name": "hemispherical", "num_rows": int(num_rows)}:
+            return HemisphericalHarmonics(num_rows)
         case {"name": "rows", "num_rows": int(num_rows)}:
             return Rowwise(num_rows)
         case _:
-            raise InputError(f"exit basis: expected diffuse or rows, got {description}")
+            raise InputError(
+                f"exit basis: expected diffuse, hemispherical or rows, got {description}"
+            )

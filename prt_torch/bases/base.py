@@ -106,5 +106,13 @@ class ExitBasis(ABC):
         """Basis functions at unit view directions in the shading frame."""
 
     @abstractmethod
+    def gram(self) -> Float[Tensor, "rows rows"]:
+        """Mean of the products of two functions over the upper hemisphere of views, float64.
+
+        A mean and not an integral, so that the Gram matrix of the constant is 1 and squared norms
+        are those of the radiance that a view sees on average.
+        """
+
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """What :func:`prt_torch.bases.exit_basis` needs to make this basis again; plain JSON."""

@@ -1,4 +1,4 @@
-r"""Real spherical harmonics: evaluation, exact rotation, projection of light.
+r"""Real spherical harmonics: evaluation, rotation, projection over the sphere and the hemisphere.
 
 Orthonormal, without the Condon-Shortley phase, index ``l * (l + 1) + m``
 (:mod:`prt_torch.conventions`). Functions are evaluated as polynomials in x, y, z,
@@ -31,6 +31,9 @@ from prt_torch.conventions import sh_index
 from prt_torch.sphere import cubemap_directions
 
 MAX_ORDER = 128
+
+PROJECTION_CUTOFF = 1e-3
+"""Smallest norm, over the largest, that a hemispherical projection divides by."""
 
 _TABLE_ELEMENTS = 2**23  # of one table of function values: 64 MiB in float64
 _TEXEL_RUN = 2048  # summed in the type of the values before the sum goes on in float64
@@ -120,6 +123,93 @@ def rotation_matrix(
         block = slice(band * band, (band + 1) * (band + 1))
         matrix[..., block, block] = weighted[:, block].mT @ turned[..., block]
     return matrix
+
+
+def hemisphere_quadrature(
+    degree: int,
+) -> tuple[Float[Tensor, "nodes 3"], Float[Tensor, "nodes"]]:
+    """Directions and weights that integrate polynomials over the upper hemisphere exactly.
+
+    Gauss-Legendre nodes in z on [0, 1] times equal steps in azimuth, float64; weights sum to 2π.
+
+    Args:
+        degree: Highest degree, in x, y and z together, that is exact; at least 0.
+    """
+    nodes, node_weights = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    steps = degree + 1
+    z = torch.from_numpy(nodes)[:, None].expand(-1, steps) * 0.5 + 0.5
+    azimuth = torch.arange(steps, dtype=torch.float64) * (2.0 * math.pi / steps)
+    radius = torch.sqrt((1.0 - z) * (1.0 + z))
+    directions = torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=-1)
+    weights = torch.from_numpy(node_weights)[:, None].expand(-1, steps) * (math.pi / steps)
+    return directions.reshape(-1, 3), weights.reshape(-1)
+
+
+def hemisphere_gram(order: int) -> Float[Tensor, "coeffs coeffs"]:
+    r"""Inner products of spherical harmonics over the upper hemisphere.
+
+    .. math:: A_{ik} = \int_{z \ge 0} y_i(s)\, y_k(s)\, ds
+
+    Near-singular from order 5 on (condition 1.5e5, 3.5e9 at order 8): factor it in float64, or
+    better use :func:`hemisphere_projection`, which never forms it.
+
+    Args:
+        order: Number of bands, at least 1.
+
+    Returns:
+        Symmetric positive definite matrix [sr-normalised, float64].
+
+    Raises:
+        ValueError: If ``order`` is out of range.
+
+    Source:
+        Sloan et al. 2003, appendix 9.1.
+    """
+    _check_order(order)
+    directions, weights = hemisphere_quadrature(2 * order - 2)
+    functions = evaluate(directions, order)
+    return functions.mT @ (functions * weights[:, None])
+
+
+def hemisphere_projection(
+    functions: Float[Tensor, "nodes rows"], weights: Float[Tensor, "nodes"]
+) -> Float[Tensor, "rows nodes"]:
+    """The least-squares optimal projection onto functions that are not orthogonal.
+
+    The matrix P for which ``P @ f`` are the coefficients c that minimise the weighted sum of
+    ``(f - functions @ c)²``: A⁻¹ b of the paper in the limit of many nodes, without forming A.
+    Combinations of the functions whose norm is below ``PROJECTION_CUTOFF`` of the largest are
+    taken as zero, since they would multiply noise by the inverse of it. All functions of up to
+    order 5 are above it.
+
+    Args:
+        functions: Values of the functions at quadrature nodes, float64.
+        weights: Quadrature weights, positive.
+
+    Source:
+        Sloan et al. 2003, appendix 9.1.
+    """
+    scale = weights.sqrt()[:, None]
+    left, singular, right = torch.linalg.svd(functions * scale, full_matrices=False)
+    kept = singular > PROJECTION_CUTOFF * singular[0]
+    inverse = torch.where(kept, 1.0 / torch.where(kept, singular, 1.0), 0.0)
+    return (right.mT * inverse) @ (left * scale).mT
+
+
+def product_matrix(order_a: int, order_b: int) -> Float[Tensor, "a b c"]:
+    r"""Coefficients of products of harmonics: :math:`y_a y_b = \sum_c G_{abc}\, y_c`, float64.
+
+    Exact; ``c`` counts order ``order_a + order_b - 1``.
+
+    Raises:
+        ValueError: If an order is out of range.
+    """
+    order_c = order_a + order_b - 1
+    directions, weights = _product_quadrature(order_c)
+    functions = evaluate(directions, order_c)
+    a, b = functions[:, : order_a**2], functions[:, : order_b**2]
+    pairs = (a[:, :, None] * b[:, None, :]).flatten(1)
+    return (pairs.mT @ (functions * weights[:, None])).unflatten(0, (order_a**2, order_b**2))
 
 
 class SphericalHarmonics(LightBasis):
