@@ -1,22 +1,31 @@
 """A run's account of itself: errors, bytes, times, pictures and what was left out."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch import evaluate, gallery, store
 from prt_torch.assets import Environment, Mesh
+from prt_torch.assets.material import Material
+from prt_torch.baking import RESOLVED
 from prt_torch.bases import LightBasis
 from prt_torch.config import PreviewConfig
+from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.report import write_html
-from prt_torch.representations import DenseTransfer, Representation
+from prt_torch.representations import CPCA, DenseTransfer, Representation
+from prt_torch.representations.coherence import overdraw, registers, superclusters
+from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
 PICTURES = "pictures"  # folder of them inside a run folder
+_ALL_BUT_ONE = 24  # functions of order 5 without the best replaced one
+_VIEWS = 6  # around the scene, that errors of glossy transfer are averaged over
 _DENSE_BLOCK_POINTS = 2000  # timed and scaled up when the whole tensor does not fit
 
 
@@ -25,9 +34,22 @@ class Inputs:
     """Everything a run reads, loaded and validated before anything is written."""
 
     mesh: Mesh
+    materials: Mapping[str, Material]
     fit_lights: list[Environment]
     test_lights: list[Environment]
     light_basis: LightBasis
+
+    @property
+    def material(self) -> str:
+        """What the parts of the scene are made of, in a few words."""
+        return ", ".join(f"{part}: {_words(made_of)}" for part, made_of in self.materials.items())
+
+
+def _words(material: Material) -> str:
+    words = ["Lambertian"] if material.lambertian else []
+    words += [str(material.glossy.describe()["name"])] if material.glossy else []
+    words += ["translucent"] if material.medium else []
+    return " + ".join(words) or "black"
 
 
 @dataclass(frozen=True)
@@ -53,14 +75,19 @@ def write_report(
     """Evaluate all results, draw them, and write report.json and report.html."""
     relighters = {one.name: Relighter(one.representation).eval() for one in fitted}
     projected = [inputs.light_basis.project(light).float() for light in inputs.test_lights]
-    lit = []
-    with torch.no_grad():
-        for environment, light in zip(inputs.test_lights, projected, strict=True):
-            reference = evaluate.dense_radiance(transfer, light[None])[0]
-            images = {name: relight(light[None])[0, 0] for name, relight in relighters.items()}
-            lit.append(gallery.Lit(environment, reference, images))
+    camera = Camera.framing(inputs.mesh, aspect=preview.width / preview.height)
+    views = _eyes(camera) if transfer.surface.exit_basis.view_dependent else None
+    lit, radiance_errors = [], {one.name: {} for one in fitted}
+    for environment, light in zip(inputs.test_lights, projected, strict=True):
+        shown, lost = _relight(relighters, transfer, light, views)
+        lit.append(gallery.Lit(environment, *shown))
+        for name, error in lost.items():
+            radiance_errors[name][environment.name] = error
     errors = {one.name: evaluate.squared_errors(one.representation, transfer) for one in fitted}
-    times, dense_seconds, scaled = _time(relighters, transfer, projected[0], memory_budget)
+    first_view = None if views is None else views[:1]
+    times, dense_seconds, scaled = _time(
+        relighters, transfer, projected[0], first_view, memory_budget
+    )
     norms = transfer.squared_norm()
     scale = float(norms.mean()) or 1.0
     pictures, opengl_drew = gallery.draw(
@@ -68,6 +95,7 @@ def write_report(
         inputs.mesh,
         lit,
         {name: (squared / scale).sqrt() for name, squared in errors.items()},
+        camera=camera,
         width=preview.width,
         height=preview.height,
         opengl=preview.opengl,
@@ -86,37 +114,75 @@ def write_report(
             "bytes": sum(one.representation.storage().values()),
             "transfer_error": lost / (float(norms.sum()) or 1.0),
             "reference_error": evaluate.reference_error(lost, transfer),
-            "radiance_error": {
-                light.environment.name: evaluate.radiance_error(
-                    light.fitted[one.name], light.reference
-                )
-                for light in lit
-            },
+            "radiance_error": radiance_errors[one.name],
             "condition": one.condition,
             "relight_seconds": times[one.name],
             "dense_seconds": dense_seconds,
             "peak_bytes": evaluate.peak_bytes(
-                lambda one=one: relighters[one.name](projected[0][None])
+                lambda one=one: relighters[one.name](projected[0][None], first_view)
             ),
         }
         if scaled:
             result["dense_scaled"] = True
+        if isinstance(one.representation, CPCA):
+            result["coherence"] = _coherence(one.representation, inputs.mesh)
         report["results"].append(result)
     store.write_json(out / "report.json", report)
     write_html(out / "report.html", report, pictures)
     return report
 
 
+def _coherence(model: CPCA, mesh: Mesh) -> dict[str, float]:
+    """How often a face is drawn (Sloan et al. 2003, section 5)."""
+    merged = superclusters(
+        model.labels,
+        mesh.faces,
+        registers_of_cluster=registers(model.ranks, model.num_rows),
+    )
+    return {
+        "overdraw": float(overdraw(model.labels, mesh.faces).double().mean()),
+        "superclusters": len(merged.unique()),
+        "overdraw_merged": float(overdraw(merged[model.labels], mesh.faces).double().mean()),
+    }
+
+
+def _eyes(camera: Camera) -> Float[Tensor, "views 3"]:
+    """Where viewers stand: at the camera, and at equal steps around what it looks at."""
+    eye, target = torch.tensor(camera.eye), torch.tensor(camera.target)
+    steps = [rotation_about_up(360.0 * turn / _VIEWS).to(eye) for turn in range(_VIEWS)]
+    return torch.stack([target + turn @ (eye - target) for turn in steps])
+
+
+@torch.no_grad()
+def _relight(
+    relighters: dict[str, Relighter], transfer: TransferTensor, light: Tensor, views: Tensor | None
+) -> tuple[tuple[Tensor, dict[str, Tensor]], dict[str, float]]:
+    """Radiance towards the camera, uncompressed and by each result, and errors over all views."""
+    reference = evaluate.dense_radiance(transfer, light[None], views)[0]
+    seen = torch.ones(1, 1) if views is None else evaluate.seen_from(transfer.surface, views)
+    seen = seen[..., None].to(reference)
+    shown, errors = {}, {}
+    for name, relight in relighters.items():
+        radiance = relight(light[None], views)[0]
+        shown[name] = radiance[0]
+        errors[name] = evaluate.radiance_error(radiance * seen, reference * seen)
+    return (reference[0], shown), errors
+
+
 def _time(
-    relighters: dict[str, Relighter], transfer: TransferTensor, light: Tensor, memory_budget: int
+    relighters: dict[str, Relighter],
+    transfer: TransferTensor,
+    light: Tensor,
+    view: Tensor | None,
+    memory_budget: int,
 ) -> tuple[dict[str, float], float, bool]:
     """Seconds to relight by each result and by the tensor itself, measured in turn."""
     scaled = transfer.num_bytes > memory_budget // 2
     points = _DENSE_BLOCK_POINTS if scaled else transfer.num_points
     dense = Relighter(DenseTransfer.from_transfer(transfer.block(slice(0, points))))
-    calls = [lambda relight=relight: relight(light[None]) for relight in relighters.values()]
+    calls = [lambda relight=relight: relight(light[None], view) for relight in relighters.values()]
     with torch.no_grad():
-        *taken, dense_taken = evaluate.median_seconds([*calls, lambda: dense(light[None])])
+        *taken, dense_taken = evaluate.median_seconds([*calls, lambda: dense(light[None], view)])
     factor = transfer.num_points / points
     return dict(zip(relighters, taken, strict=True)), dense_taken * factor, scaled
 
@@ -124,21 +190,29 @@ def _time(
 def _facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
     """Scene, light and bake of report.json."""
     mesh, made = inputs.mesh, transfer.provenance
+    bounces = made.get("bounces", {})
     return {
         "scene": {
             "mesh": mesh.name,
             "points": mesh.num_points,
             "faces": mesh.num_faces,
-            "material": "diffuse",
+            "material": inputs.material,
             "rows": transfer.num_rows,
             "channels": transfer.num_channels,
             "warnings": [asdict(warning) for warning in mesh.warnings],
         },
         "light": {"basis": inputs.light_basis.name, "coeffs": transfer.num_coeffs},
         "bake": {
-            "seconds": made["visibility_seconds"] + made["projection_seconds"],
-            "rays": made["rays"],
-            "cached": made["visibility_cached"] and made["projection_cached"],
+            "seconds": made["visibility_seconds"]
+            + made["projection_seconds"]
+            + bounces.get("seconds", 0.0)
+            + made.get("subsurface_seconds", 0.0),
+            "rays": made["rays"] + bounces.get("rays", 0),
+            "cached": made["visibility_cached"]
+            and made["projection_cached"]
+            and bounces.get("cached", True),
+            "bounces": bounces.get("added", []),
+            "material_unresolved": made["unresolved"] if made["unresolved"] > RESOLVED else None,
         },
         "raw_bytes": transfer.num_bytes,
     }
@@ -149,18 +223,31 @@ def _left_out(
 ) -> list[dict[str, Any]]:
     """What this scene does not need, why, and what leaving it out saved."""
     mesh, values = inputs.mesh, transfer.num_bytes - transfer.surface.reflectance.nbytes
-    left_out = [
-        {
-            "what": "two of three colour channels of transfer",
-            "why": "reflectance is a factor of its own",
-            "saved_bytes": 2 * values,
-        },
-        {
-            "what": "views and exit rows",
-            "why": "the material is diffuse: radiance is the same in every direction",
-            "saved_bytes": 0,
-        },
-    ]
+    left_out = _left_out_light(transfer)
+    if transfer.num_channels == 1:
+        left_out.append(
+            {
+                "what": "two of three colour channels of transfer",
+                "why": "colour is a factor of its own, or there is none",
+                "saved_bytes": 2 * values,
+            }
+        )
+    if not transfer.surface.exit_basis.view_dependent:
+        left_out.append(
+            {
+                "what": "views and exit rows",
+                "why": "the material is diffuse: radiance is the same in every direction",
+                "saved_bytes": 0,
+            }
+        )
+    elif transfer.num_rows == _ALL_BUT_ONE:
+        left_out.append(
+            {
+                "what": "the exit function y_(1,0)",
+                "why": "over the hemisphere the other 24 replace it to 1.5e-5 of its square",
+                "saved_bytes": values // _ALL_BUT_ONE,
+            }
+        )
     if len(transfer.surface.reflectance) == 1:
         left_out.append(
             {
@@ -189,3 +276,19 @@ def _left_out(
             }
         )
     return left_out
+
+
+def _left_out_light(transfer: TransferTensor) -> list[dict[str, Any]]:
+    """Bounces that were not gathered."""
+    bounces = transfer.provenance.get("bounces")
+    if bounces is None:
+        return []
+    if bounces["skipped"]:
+        why = "no ray from any point hits the scene again"
+        return [{"what": "all bounces between points", "why": why, "saved_seconds": 0.0}]
+    if not bounces["ended"]:
+        return []
+    added, seconds = bounces["added"], bounces["seconds"]
+    why = f"bounce {len(added)} added {added[-1]:.1e} of the light, the first {added[0]:.1e}"
+    saved = seconds / len(added)
+    return [{"what": f"bounces after {len(added)}", "why": why, "saved_seconds": saved}]

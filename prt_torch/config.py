@@ -60,6 +60,23 @@ class LightConfig(_Section):
     exposure: float = Field(0.0, ge=-100, le=100, description="stops")
 
 
+class PartConfig(_Section):
+    """What a part of the scene is made of."""
+
+    lambertian: bool = Field(True, description="reflects diffusely with the albedo of the mesh")
+    glossy: dict[str, Any] | None = Field(None, description="a reflectance model: name, parameters")
+    medium: str | None = Field(None, description="a translucent inside, by name of a preset")
+    millimetres_per_unit: float = Field(1.0, gt=0, description="size of a mesh unit")
+
+
+class MaterialConfig(PartConfig):
+    """What the object is made of; the ground is Lambertian."""
+
+    parts: dict[str, PartConfig] = Field(
+        default_factory=dict, description="other materials, by name of a part of the mesh"
+    )
+
+
 class TransferConfig(_Section):
     """What is baked."""
 
@@ -67,6 +84,9 @@ class TransferConfig(_Section):
     order: int = Field(6, ge=1, le=64, description="bands of spherical harmonics")
     resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
     supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
+    rows: int = Field(24, ge=2, le=64, description="exit functions of glossy scenes")
+    max_bounces: int = Field(0, ge=0, le=64, description="0 is direct light only")
+    tolerance: float = Field(1e-3, ge=0, lt=1, description="share of the light of a last bounce")
 
     @model_validator(mode="after")
     def _rays_fill_whole_bytes(self) -> "TransferConfig":
@@ -84,8 +104,35 @@ class CPCAConfig(_Section):
 
     name: Literal["cpca"] = "cpca"
     num_clusters: int = Field(128, ge=1)
-    rank: int = Field(4, ge=1)
-    method: Literal["iterative", "static"] = "iterative"
+    rank: int = Field(4, ge=1, description="vectors a cluster beside its mean")
+    method: Literal["iterative", "static", "adaptive"] = "iterative"
+    affine: bool = Field(True, description="clusters have means")
+    max_error: float | None = Field(None, gt=0, description="choose clusters and rank by error")
+    max_bytes: int | None = Field(None, ge=1, description="choose clusters and rank by bytes")
+    max_relight_seconds: float | None = Field(None, gt=0, description="choose them by time")
+    reclassify: float = Field(0.0, ge=0, le=1, description="share of error to lower overdraw for")
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The limit that chooses clusters and rank, if one is given."""
+        given = {
+            "max_error": self.max_error,
+            "max_bytes": self.max_bytes,
+            "max_relight_seconds": self.max_relight_seconds,
+        }
+        return {name: value for name, value in given.items() if value is not None}
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> "CPCAConfig":
+        if len(self.limits) > 1:
+            raise PydanticCustomError(
+                "limits",
+                "at most one limit may be given, got {names}",
+                {"names": list(self.limits)},
+            )
+        if self.limits and not self.affine:
+            raise PydanticCustomError("limits", "a limit chooses affine clusters only")
+        return self
 
 
 RepresentationConfig = CPCAConfig
@@ -112,6 +159,7 @@ class RunConfig(_Section):
     """One complete run."""
 
     scene: SceneConfig
+    material: MaterialConfig
     light: LightConfig
     transfer: TransferConfig
     representation: RepresentationConfig = Field(..., description="the one to fit")
@@ -213,7 +261,7 @@ def _compose(config_dir: Path, name: str, overrides: list[str]) -> Any:
         raise InputError(f"configuration: {_explain(error)}") from error
 
 
-_GROUPS = ("scene", "light", "transfer", "representation", "fit", "preview")
+_GROUPS = ("scene", "material", "light", "transfer", "representation", "fit", "preview")
 
 
 def _parse(override: str, *, grid: bool) -> Override:

@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from prt_torch.representations import Representation
-from prt_torch.transfer import TransferTensor
+from prt_torch.relight import Relighter
+from prt_torch.representations import DenseTransfer, Representation
+from prt_torch.transfer import Surface, TransferTensor
 
 _BLOCK_BYTES = 2**27
 
@@ -55,22 +56,39 @@ def reference_error(squared_error: float, transfer: TransferTensor) -> float | N
     return (max(lost, 0.0) + squared_error) / full if full > 0 else 0.0
 
 
+@torch.no_grad()
 def dense_radiance(
-    transfer: TransferTensor, light: Float[Tensor, "batch coeffs rgb"]
-) -> Float[Tensor, "batch points rgb"]:
-    """Radiance of a diffuse tensor itself, reflectance included, read by blocks of points.
+    transfer: TransferTensor,
+    light: Float[Tensor, "batch coeffs rgb"],
+    views: Float[Tensor, "views 3"] | None = None,
+) -> Float[Tensor, "batch views points rgb"]:
+    """Radiance of a tensor itself, reflectance included, read by blocks of points.
+
+    Args:
+        transfer: The tensor.
+        light: Light coefficients.
+        views: Where each viewer is, in mesh units; diffuse transfer needs none and gives one view.
 
     Raises:
-        ValueError: If the tensor has several rows, which need views.
+        ValueError: If the tensor needs views and none are given.
     """
-    if transfer.num_rows != 1:
-        raise ValueError(f"expected diffuse transfer, got {transfer.num_rows} rows")
-    equation = "pci,bic->bpc" if transfer.num_channels == 3 else "pzi,bic->bpc"
-    pieces = [
-        torch.einsum(equation, values[:, :, 0], light.to(values))
-        for _, values in transfer.blocks(_BLOCK_BYTES)
-    ]
-    return torch.cat(pieces, dim=1) * transfer.surface.reflectance.to(light)
+    pieces = []
+    for rows, _ in transfer.blocks(_BLOCK_BYTES):
+        relight = Relighter(DenseTransfer.from_transfer(transfer.block(rows)))
+        pieces.append(relight(light.to(transfer.values.dtype), views))
+    return torch.cat(pieces, dim=2)
+
+
+def seen_from(surface: Surface, views: Float[Tensor, "views 3"]) -> Bool[Tensor, "views points"]:
+    """Which points have each viewer above their horizon; the others show nobody their radiance.
+
+    Raises:
+        ValueError: If the surface has no frames or positions.
+    """
+    if surface.frames is None or surface.positions is None:
+        raise ValueError("this transfer has no frames and positions to tell where its points face")
+    towards = views[:, None] - surface.positions.to(views)
+    return (surface.frames[:, 2].to(views) * towards).sum(-1) > 0
 
 
 def radiance_error(

@@ -34,7 +34,7 @@ class Lit:
 
     Attributes:
         environment: The light.
-        reference: Radiance of every point from the uncompressed tensor, ``"points rgb"``.
+        reference: Radiance of every point towards the camera from the uncompressed tensor.
         fitted: The same from each result, by name.
     """
 
@@ -49,6 +49,7 @@ def draw(
     lit: list[Lit],
     errors: Mapping[str, Float[Tensor, "points"]],
     *,
+    camera: Camera,
     width: int,
     height: int,
     opengl: bool,
@@ -63,6 +64,7 @@ def draw(
         mesh: The scene.
         lit: What each light does to it.
         errors: Relative error of each point, by result.
+        camera: Where all pictures are taken from.
         width: Pixels in a row.
         height: Rows.
         opengl: Whether to try OpenGL.
@@ -73,7 +75,6 @@ def draw(
     Raises:
         InputError: If a file cannot be written.
     """
-    camera = Camera.framing(mesh, aspect=width / height)
     hits = trace(mesh, camera, width, height)
     pictures = []
     for light in lit:

@@ -6,6 +6,7 @@ each. A run that was killed goes on where it stopped when it is started again.
 """
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,20 @@ from prt_torch.assets import (
     load_mesh,
     procedural_scene,
 )
-from prt_torch.baking import check_memory, project_diffuse, trace_visibility
+from prt_torch.assets.brdf import brdf
+from prt_torch.assets.material import Material
+from prt_torch.assets.medium import PRESETS
+from prt_torch.baking import RESOLVED, bake, check_memory
 from prt_torch.bases import CubeDirections, LightBasis, SphericalHarmonics
-from prt_torch.config import RepresentationConfig, RunConfig
+from prt_torch.config import PartConfig, RepresentationConfig, RunConfig
 from prt_torch.errors import InputError
 from prt_torch.fitting import fit
 from prt_torch.gallery import file_name
 from prt_torch.metric import Metric
 from prt_torch.report import summary_table
 from prt_torch.representations import CPCA, load, save
+from prt_torch.representations.coherence import reclassify
+from prt_torch.representations.cpca_relabel import ClusterErrors, with_labels
 from prt_torch.transfer import TransferTensor
 
 CONFIG, RESULTS = "config.yaml", "results"
@@ -141,7 +147,8 @@ def _load(config: RunConfig) -> Inputs:
             for name in names
         ]
 
-    inputs = Inputs(mesh, find(light.fit), find(light.test), _light_basis(config))
+    basis = _light_basis(config)
+    inputs = Inputs(mesh, _materials(config, mesh), find(light.fit), find(light.test), basis)
     if config.fit.metric == "light_prior" and not inputs.fit_lights:
         raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
     names = [file_name(environment.name) for environment in inputs.test_lights]
@@ -153,6 +160,33 @@ def _load(config: RunConfig) -> Inputs:
     fine = config.transfer.resolution * config.transfer.supersampling
     check_memory(inputs.light_basis, fine, config.memory_budget)
     return inputs
+
+
+def _materials(config: RunConfig, mesh: Mesh) -> dict[str, Material]:
+    """The material of each part: the object's for all but the ground, unless named."""
+    scene, names = config.material, [part.name for part in mesh.parts]
+    unknown = [name for name in scene.parts if name not in names]
+    if unknown:
+        raise InputError(
+            f"material.parts: no part {unknown[0]!r}; expected one of {', '.join(names)}"
+        )
+    own = _material("material", scene)
+    others = {name: _material(f"material.parts.{name}", at) for name, at in scene.parts.items()}
+    return {name: others.get(name, Material() if name == "ground" else own) for name in names}
+
+
+def _material(key: str, wanted: PartConfig) -> Material:
+    medium = None
+    if wanted.medium is not None:
+        if wanted.medium not in PRESETS:
+            choices = ", ".join(PRESETS)
+            raise InputError(f"{key}.medium: unknown {wanted.medium!r}; expected one of {choices}")
+        medium = PRESETS[wanted.medium]
+    try:
+        glossy = None if wanted.glossy is None else brdf(wanted.glossy)
+    except InputError as error:
+        raise InputError(f"{key}.glossy: {error}") from error
+    return Material(wanted.lambertian, glossy, medium, wanted.millimetres_per_unit)
 
 
 def _light_basis(config: RunConfig) -> LightBasis:
@@ -182,28 +216,33 @@ def _check_folder(out: Path, config: RunConfig, inputs: Inputs) -> None:
 
 
 def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor:
-    cache = Path(config.cache)
     with _progress(console) as progress:
 
-        def tell(what: str):
+        def stage(what: str) -> Callable[[int, int], None]:
             task = progress.add_task(what, total=inputs.mesh.num_points)
             return lambda done, total: progress.update(task, completed=done, total=total)
 
-        visibility = trace_visibility(
+        transfer = bake(
             inputs.mesh,
+            materials=inputs.materials,
+            light_basis=inputs.light_basis,
+            num_rows=config.transfer.rows,
+            max_bounces=config.transfer.max_bounces,
+            tolerance=config.transfer.tolerance,
             resolution=config.transfer.resolution,
             supersampling=config.transfer.supersampling,
-            cache=cache,
-            progress=tell("trace visibility"),
-        )
-        return project_diffuse(
-            inputs.mesh,
-            visibility,
-            inputs.light_basis,
-            cache=cache,
+            cache=config.cache,
             memory_budget=config.memory_budget,
-            progress=tell("project transfer"),
+            stages=stage,
         )
+    if transfer.provenance["unresolved"] > RESOLVED:
+        console.print(
+            "warning: sharp_material: the lobe of a material is too narrow for its quadrature, "
+            f"which still changes by {transfer.provenance['unresolved']:.1e}",
+            style="yellow",
+            soft_wrap=True,
+        )
+    return transfer
 
 
 def _progress(console: Console) -> Progress:
@@ -222,7 +261,8 @@ def _fit_all(
     metric = Metric.l2(transfer)
     if config.fit.metric == "light_prior":
         lights = torch.stack([inputs.light_basis.project(light) for light in inputs.fit_lights])
-        metric = Metric.light_prior(lights, inputs.light_basis)
+        exit_basis = transfer.surface.exit_basis
+        metric = Metric.light_prior(lights, inputs.light_basis, exit_basis=exit_basis)
     fitted = []
     with _progress(console) as progress:
         for wanted in config.fitted:
@@ -234,6 +274,7 @@ def _fit_all(
                     name,
                     wanted,
                     config,
+                    inputs,
                     transfer,
                     metric,
                     lambda done, total, task=task: progress.update(task, completed=done),
@@ -245,7 +286,39 @@ def _fit_all(
 
 def _name(wanted: RepresentationConfig) -> str:
     method = "" if wanted.method == "iterative" else f" {wanted.method}"
-    return f"{wanted.name}{method} {wanted.num_clusters}x{wanted.rank}"
+    linear = "" if wanted.affine else " linear"
+    moved = f" reclassified {wanted.reclassify:g}" if wanted.reclassify else ""
+    size = f"{wanted.num_clusters}x{wanted.rank}"
+    for limit, value in wanted.limits.items():
+        size = f"{limit.removeprefix('max_')} {value:g}"
+    return f"{wanted.name}{method}{linear} {size}{moved}"
+
+
+def _closed_form(
+    wanted: RepresentationConfig,
+    config: RunConfig,
+    inputs: Inputs,
+    transfer: TransferTensor,
+    metric: Metric,
+) -> CPCA:
+    """A representation as its paper constructs it."""
+    generator = torch.Generator().manual_seed(config.seed)
+    common: dict[str, Any] = {"method": wanted.method, "metric": metric, "generator": generator}
+    if wanted.limits:
+        model = CPCA.within(transfer, **wanted.limits, **common)  # pyright: ignore[reportArgumentType]
+    else:
+        model = CPCA.from_transfer(
+            transfer,
+            num_clusters=wanted.num_clusters,
+            rank=wanted.rank,
+            affine=wanted.affine,
+            **common,
+        )
+    if wanted.reclassify:
+        errors = ClusterErrors(model, transfer, metric)
+        labels = reclassify(model.labels, inputs.mesh.faces, errors, budget=wanted.reclassify)
+        model = with_labels(model, transfer, labels, metric)
+    return model
 
 
 def _fit_one(
@@ -253,6 +326,7 @@ def _fit_one(
     name: str,
     wanted: RepresentationConfig,
     config: RunConfig,
+    inputs: Inputs,
     transfer: TransferTensor,
     metric: Metric,
     progress: Any,
@@ -264,14 +338,7 @@ def _fit_one(
         checkpoint.unlink(missing_ok=True)
         return Fitted(name, load(path), **store.read_json(record))
     start = time.perf_counter()
-    representation = CPCA.from_transfer(
-        transfer,
-        num_clusters=wanted.num_clusters,
-        rank=wanted.rank,
-        method=wanted.method,
-        metric=metric,
-        generator=torch.Generator().manual_seed(config.seed),
-    )
+    representation = _closed_form(wanted, config, inputs, transfer, metric)
     result = fit(
         representation,
         transfer,

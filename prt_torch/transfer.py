@@ -3,10 +3,13 @@
 Everything upstream (meshes, rays, materials) ends in a :class:`TransferTensor`; everything
 downstream (representations, relighting, reports) begins with one. It need not have come from a
 mesh: :meth:`TransferTensor.from_dense` takes any array.
+
+Several transfers of one scene, such as glossy reflection and subsurface scattering, add up to one
+by :func:`add`, whatever their exit bases.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -200,3 +203,74 @@ class TransferTensor:
         if basis is None:
             return values.square().sum((1, 2, 3))
         return basis.squared_norm(values).sum((1, 2))
+
+
+def add(terms: Sequence[TransferTensor]) -> TransferTensor:
+    """The sum of several transfers of the same points and light basis, read lazily by blocks.
+
+    Diffuse terms enter the constant function of a glossy exit basis. Reflectance stays a factor
+    where all terms share it; otherwise it is multiplied in, which makes three channels unless it
+    is grey.
+
+    Args:
+        terms: At least one. Their exit bases are diffuse, or one and the same.
+
+    Raises:
+        ValueError: If points, light bases or exit bases do not fit together.
+
+    Source:
+        Sloan et al. 2003, section 3.1 and figure 9 (subsurface and glossy transfer in one matrix).
+    """
+    first = terms[0]
+    if len(terms) == 1:
+        return first
+    glossy = [term for term in terms if not isinstance(term.surface.exit_basis, Diffuse)]
+    surface = (glossy or terms)[0].surface
+    kinds = {str(term.surface.exit_basis.describe()) for term in glossy}
+    sizes = {(term.num_points, term.num_coeffs) for term in terms}
+    lights = {str(t.surface.light_basis and t.surface.light_basis.describe()) for t in terms}
+    if len(kinds) > 1 or len(sizes) > 1 or len(lights) > 1:
+        raise ValueError(
+            "expected terms of the same points and light basis, diffuse or of one exit basis, got "
+            f"points and coeffs {sorted(sizes)}, light {sorted(lights)}, exit {sorted(kinds)}"
+        )
+    shared = all(torch.equal(term.surface.reflectance, first.surface.reflectance) for term in terms)
+    values = _SumOfRows(terms, surface.exit_basis, factored=shared)
+    reflectance = first.surface.reflectance if shared else torch.ones(1, 3)
+    provenance = {"terms": [term.provenance for term in terms]}
+    return TransferTensor(values, replace(surface, reflectance=reflectance), None, provenance)
+
+
+class _SumOfRows:
+    """Values of several transfers in one exit basis, added where they are read."""
+
+    def __init__(self, terms: Sequence[TransferTensor], basis: ExitBasis, *, factored: bool):
+        self._terms, self._factored = list(terms), factored
+        constant = basis.evaluate(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))[0]
+        self._constant = float(constant)
+        colours = [term.num_channels for term in terms]
+        if not factored:
+            colours += [1 if is_grey(term.surface.reflectance) else 3 for term in terms]
+        first = terms[0]
+        self.shape = (first.num_points, max(colours), basis.num_rows, first.num_coeffs)
+        self.dtype = torch.promote_types(*(term.values.dtype for term in terms[:2]))
+
+    def __getitem__(self, rows: slice, /) -> Tensor:
+        total = torch.zeros(len(range(*rows.indices(self.shape[0]))), *self.shape[1:])
+        total = total.to(self.dtype)
+        for term in self._terms:
+            values = term.values[rows].to(self.dtype)
+            if not self._factored:
+                reflectance = term.surface.reflectance.to(values)
+                reflectance = reflectance if len(reflectance) == 1 else reflectance[rows]
+                values = values * reflectance[:, : self.shape[1], None, None]
+            if term.num_rows == self.shape[2]:
+                total += values
+            else:
+                total[:, :, 0] += values[:, :, 0] / self._constant
+        return total
+
+
+def is_grey(reflectance: Float[Tensor, "points channels"]) -> bool:
+    """Whether all channels are the same at every point."""
+    return bool((reflectance == reflectance[:, :1]).all())

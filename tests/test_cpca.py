@@ -7,7 +7,7 @@ from contract import Contract, random_transfer, relative
 from sklearn.decomposition import PCA
 
 from prt_torch.representations import CPCA, DenseTransfer
-from prt_torch.representations.cpca_encoding import _principal
+from prt_torch.representations.cpca_subspaces import principal
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.transfer import TransferTensor
 
@@ -141,7 +141,7 @@ def test_singular_values_of_stiff_clusters(condition):
     right = torch.linalg.qr(torch.randn(12, 12, generator=generator, dtype=torch.float64))[0]
     values = torch.logspace(0, -np.log10(condition), 12, dtype=torch.float64)
     rows = left @ torch.diag(values) @ right.mT
-    singular, vectors = _principal(rows[None], 12)
+    singular, vectors = principal(rows[None], 12)
     trusted = values > 1e-13  # of what float64 can hold of the matrix itself
     error = (singular[0] - values).abs() / values
     limit = 1e-9 if condition <= 1e5 else 1e-16 * condition * 50
@@ -189,7 +189,7 @@ def test_wide_points_are_projected_without_losing_the_fit():
         ({"num_clusters": 0}, "at least 1 cluster"),
         ({"num_clusters": -3}, "at least 1 cluster"),
         ({"rank": -1}, "rank of at least 0"),
-        ({"method": "magic"}, "iterative or static"),
+        ({"method": "magic"}, "iterative, static or adaptive"),
     ],
 )
 def test_bad_budgets(options, message, without_type_checker):

@@ -1,4 +1,4 @@
-"""Spherical harmonics over the hemisphere: every claim of Sloan et al. 2003, appendix 9, by digits."""
+"""Harmonics over the hemisphere: every claim of Sloan et al. 2003, appendix 9, by its digits."""
 
 import math
 
@@ -14,8 +14,8 @@ GRAM = sh.hemisphere_gram(5)
 
 def odd_in_z(order: int) -> torch.Tensor:
     """Which harmonics change sign with z: those with l + m odd."""
-    pairs = [(l, m) for l in range(order) for m in range(-l, l + 1)]
-    return torch.tensor([(l + m) % 2 == 1 for l, m in pairs])
+    pairs = [(band, m) for band in range(order) for m in range(-band, band + 1)]
+    return torch.tensor([(band + m) % 2 == 1 for band, m in pairs])
 
 
 def test_gram_against_numerical_integration():
@@ -167,6 +167,14 @@ def test_projection_stays_bounded_where_the_gram_matrix_is_singular_to_rounding(
     smooth = torch.exp(views[:, 2] - views[:, 0])
     lost = (functions @ (project @ smooth) - smooth).square() @ weights / (smooth**2 @ weights)
     assert float(lost) < 1e-5
+
+
+def test_inverse_is_exact_to_order_5_and_bounded_beyond():
+    for order in (1, 3, 5):
+        product = sh.hemisphere_inverse(order) @ sh.hemisphere_gram(order)
+        assert torch.allclose(product, torch.eye(order**2, dtype=torch.float64), atol=1e-9)
+    for order in (6, 8, 12):
+        assert float(torch.linalg.matrix_norm(sh.hemisphere_inverse(order), ord=2)) < 1.01e6
 
 
 @pytest.mark.parametrize("num_rows", [1, 2, 4, 9, 15, 16, 24, 25, 36, 64])

@@ -97,6 +97,19 @@ class Tracer:
         """Bare Embree any-hit queries: 0 where a ray hits something, -1 where it is free."""
         return self._scene.run(origins, directions, query="OCCLUDED")
 
+    def closest(self, points: np.ndarray, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bare Embree closest-hit queries, each from a point through a texel.
+
+        Returns:
+            ``"rays"`` faces, -1 where a ray hits nothing, and ``"rays 3"`` barycentric weights of
+            their corners.
+        """
+        found = self._scene.run(
+            self._origins[points], self._directions[texels], query="INTERSECT", output=1
+        )
+        u, v = found["u"], found["v"]  # of the second and the third corner
+        return found["primID"], np.stack([1 - u - v, u, v], axis=-1)
+
     def trace(self, points: range) -> tuple[np.ndarray, int]:
         """Packed bits of some points, and how many rays that took."""
         num_texels = len(self._directions)

@@ -196,6 +196,23 @@ def hemisphere_projection(
     return (right.mT * inverse) @ (left * scale).mT
 
 
+def hemisphere_inverse(order: int) -> Float[Tensor, "coeffs coeffs"]:
+    """A⁻¹ for exact inner products over the hemisphere, float64.
+
+    Cut off as :func:`hemisphere_projection` is: to order 5 it is the inverse of
+    :func:`hemisphere_gram`; beyond, combinations too weak to divide by are taken as zero.
+
+    Raises:
+        ValueError: If ``order`` is out of range.
+
+    Source:
+        Sloan et al. 2003, appendix 9.1.
+    """
+    eigenvalues, vectors = torch.linalg.eigh(hemisphere_gram(order))
+    kept = eigenvalues > PROJECTION_CUTOFF**2 * eigenvalues[-1]
+    return (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].mT
+
+
 def product_matrix(order_a: int, order_b: int) -> Float[Tensor, "a b c"]:
     r"""Coefficients of products of harmonics: :math:`y_a y_b = \sum_c G_{abc}\, y_c`, float64.
 

@@ -1,0 +1,118 @@
+r"""Glossy direct light: visibility bits to matrices from light to exit radiance.
+
+With light in spherical harmonics the incident radiance of a point has the inner products
+
+.. math:: T_{ij} = \int V(s)\, y_i(s)\, y_j(s)\, ds = \sum_k G_{ijk} \int V(s)\, y_k(s)\, ds
+
+because products of harmonics are harmonics. So all that is needed of the bits is their projection
+onto the few harmonics of order ``n_i + n_j - 1``; no material and no pair of functions is ever
+summed over texels. Turned into the shading frame, T meets the material's matrix:
+``M_p = A⁻¹ B A⁻¹ R_p T_p``.
+
+Source:
+    Sloan, Hall, Hart, Snyder 2003, section 3.1 and equation 1.
+"""
+
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from prt_torch import store
+from prt_torch.assets.mesh import Mesh
+from prt_torch.baking.direct import check_memory
+from prt_torch.baking.reflection import Reflection
+from prt_torch.baking.visibility import Progress, VisibilityField
+from prt_torch.bases import SphericalHarmonics, sh
+from prt_torch.sphere import cubemap_solid_angles, frame_from_normal
+from prt_torch.transfer import Surface, TransferTensor
+
+_POINTS_PER_SHARD = 1024
+_ALGORITHM = 1  # raise it when the same inputs would give other values
+
+
+def project_glossy(
+    mesh: Mesh,
+    visibility: VisibilityField,
+    reflection: Reflection,
+    light_basis: SphericalHarmonics,
+    *,
+    reflectance: Tensor | None = None,
+    cache: Path | None = None,
+    memory_budget: int = 4 * 2**30,
+    progress: Progress | None = None,
+) -> TransferTensor:
+    """Glossy shadowed transfer, without bounces.
+
+    Args:
+        mesh: The scene that ``visibility`` was traced for.
+        visibility: Its visibility bits.
+        reflection: How its points reflect.
+        light_basis: What to expand the light in.
+        reflectance: ``"points_or_one rgb"`` that multiplies at the end; ones if not given.
+        cache: Folder of bakes; None keeps the values in memory.
+        memory_budget: Bytes that one block of the computation may take.
+        progress: Told of points done and points in all.
+
+    Returns:
+        Rows of the reflection's exit basis. Points without a normal have zero transfer.
+
+    Raises:
+        ValueError: If mesh and visibility do not belong together.
+        InputError: If the memory budget is too small, or the cache cannot be written or is damaged.
+    """
+    if visibility.bits.shape[0] != mesh.num_points:
+        raise ValueError(
+            f"expected visibility of {mesh.num_points} points, got {visibility.bits.shape[0]}"
+        )
+    seen_basis = SphericalHarmonics(reflection.order + light_basis.order - 1)
+    at_once = check_memory(seen_basis, visibility.resolution, memory_budget)
+    solid_angles = cubemap_solid_angles(visibility.resolution).reshape(-1)
+    products = sh.product_matrix(reflection.order, light_basis.order).flatten(0, 1).mT
+    frames = frame_from_normal(mesh.normals)
+
+    def project(rows: slice) -> tuple[dict[str, Tensor], dict[str, int | float]]:
+        start = time.perf_counter()
+        pieces = []
+        for first in range(rows.start, rows.stop, at_once):
+            some = slice(first, min(first + at_once, rows.stop))
+            seen = visibility.unpack(some).float() * solid_angles
+            pieces.append(seen_basis.project_cube(seen, visibility.resolution))
+        incident = torch.cat(pieces).double() @ products
+        incident = incident.unflatten(1, (reflection.order**2, light_basis.num_coeffs))
+        local = sh.rotation_matrix(frames[rows], reflection.order) @ incident
+        values = reflection.reflect(rows, local[:, None]).float()
+        return {"values": values}, {"seconds": time.perf_counter() - start}
+
+    inputs = {
+        "visibility": store.digest(mesh.vertices, mesh.faces, visibility.resolution),
+        "normals": store.digest(mesh.normals),
+        "light_basis": light_basis.describe(),
+        "reflection": reflection.digest(),
+        "algorithm": _ALGORITHM,
+    }
+    built = store.build_sharded(
+        project,
+        rows=mesh.num_points,
+        rows_per_shard=_POINTS_PER_SHARD,
+        inputs=inputs,
+        folder=None if cache is None else Path(cache) / f"transfer-{store.digest(inputs)[:16]}",
+        progress=progress,
+    )
+    surface = Surface(
+        exit_basis=reflection.exit_basis,
+        light_basis=light_basis,
+        reflectance=torch.ones(1, 3) if reflectance is None else reflectance,
+        frames=frames,
+        positions=mesh.vertices,
+    )
+    provenance = {
+        "inputs": inputs,
+        "rays": visibility.rays,
+        "visibility_seconds": visibility.seconds,
+        "projection_seconds": built.counts["seconds"],
+        "visibility_cached": visibility.cached,
+        "projection_cached": built.cached,
+    }
+    return TransferTensor(built.tensors["values"], surface, None, provenance)

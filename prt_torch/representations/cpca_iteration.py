@@ -1,0 +1,220 @@
+"""Clusters by the error of their own subspaces.
+
+For each rank from 1 up, turns of {one step of orthogonal iteration of every cluster's vectors;
+move each point to the best of the clusters nearest to its own}, until few points move. A step of
+orthogonal iteration started from the last turn's vectors never loses what they held, so the error
+falls in every turn, at a small part of the price of an eigen-decomposition.
+
+Points are taken in their common principal axes, and only as many of these as matter: what lies
+beyond is lost alike in nearly every cluster, so while it is a small part of the error it does not
+change the choice between them.
+
+Errors are computed from differences to the cluster's own mean, so they keep their digits when the
+error is far below the signal.
+
+Source:
+    Sloan, Hall, Hart, Snyder 2003, section 4.2.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from prt_torch.representations.cpca_clusters import refill
+from prt_torch.representations.cpca_subspaces import one_thread
+from prt_torch.representations.grouped import ClusterBlocks, sort_labels
+
+NEAREST = 16
+"""Clusters a point may move to in one turn."""
+
+_TURNS_PER_RANK = 6
+_LAST_TURNS = 16
+_FEW_MOVES = 2e-3  # share of points; below it a turn ends a rank
+_IGNORED = 0.05  # share of the error that the axes left out may hold
+_CHUNK_ELEMENTS = 2**21  # of one table of products; larger ones cost more for their memory
+
+
+class PrincipalAxes:
+    """Points in their common principal axes.
+
+    Args:
+        data: ``"points d"``, less their mean where the subspaces are affine.
+    """
+
+    def __init__(self, data: Float[Tensor, "points d"]):
+        scale = float(data.abs().max()) or 1.0
+        scaled = data / scale
+        moment = (scaled.mT @ scaled).double()
+        with one_thread():
+            energies, axes = torch.linalg.eigh(moment)
+        energies = energies.flip(0).clamp_min(0.0) * scale**2
+        self.axes = axes.flip(1).to(data)
+        self.points = data @ self.axes
+        self.energy = float(energies.sum())
+        self.beyond = self.energy - energies.cumsum(0)
+
+    def enough(self, error: float, least: int) -> int:
+        """How many axes leave out a small part of this error; at least so many."""
+        matter = int((self.beyond > _IGNORED * error).sum()) + 1
+        return min(max(matter, least), self.axes.shape[1])
+
+    def leading(self, count: int) -> Float[Tensor, "points count"]:
+        """The points in the first axes."""
+        return self.points[:, :count].contiguous()
+
+
+def iterate(
+    data: Float[Tensor, "points d"],
+    labels: Int[Tensor, "points"],
+    num_clusters: int,
+    rank: int,
+    affine: bool,
+    generator: torch.Generator,
+) -> Int[Tensor, "points"]:
+    """Move points between clusters, whose vectors grow one by one to ``rank``."""
+    axes = PrincipalAxes(data)
+    vectors = data.new_zeros(num_clusters, 0, 0)
+    points, error = axes.points, axes.energy
+    if affine:
+        labels, _ = sort_labels(labels, num_clusters)
+        seen = Subspaces(points, labels, data.new_zeros(num_clusters, data.shape[1], 0), True)
+        error = float(seen.spread().double().sum())
+    for size in range(1, rank + 1):
+        count = axes.enough(error, least=size)
+        points = axes.leading(count)
+        vectors = torch.nn.functional.pad(vectors, (0, 0, 0, count - vectors.shape[1]))
+        fresh = torch.randn(num_clusters, count, 1, generator=generator).to(data)
+        vectors = torch.cat([vectors, fresh], dim=2)
+        last = size == rank
+        for turn in range(_LAST_TURNS if last else _TURNS_PER_RANK):
+            labels, old = sort_labels(labels, num_clusters)
+            fit = Subspaces(points, labels, vectors[old], affine, steps=3 if turn == 0 else 1)
+            vectors = fit.vectors
+            moved, errors = fit.reassign(NEAREST)
+            error = float(errors.double().sum() + axes.beyond[count - 1])
+            few = int((moved != labels).sum()) <= _FEW_MOVES * len(labels)
+            labels = moved
+            if few:
+                break
+    labels, old = sort_labels(labels, num_clusters)
+    return Subspaces(points, labels, vectors[old], affine, steps=1).reassign(num_clusters)[0]
+
+
+class Subspaces:
+    """Means and vectors of every cluster for given labels, and what a point would lose in each.
+
+    Args:
+        points: The points.
+        labels: Their clusters, numbered from the largest to the smallest.
+        vectors: Where the orthogonal iteration starts, ``"clusters d rank"``.
+        affine: Whether clusters have means, or their subspaces go through the origin.
+        steps: Steps of orthogonal iteration.
+    """
+
+    def __init__(
+        self,
+        points: Float[Tensor, "points d"],
+        labels: Int[Tensor, "points"],
+        vectors: Float[Tensor, "clusters d rank"],
+        affine: bool,
+        steps: int = 0,
+    ):
+        self.num_clusters = len(vectors)
+        self.blocks = ClusterBlocks(labels, self.num_clusters)
+        self.centred = points.index_select(0, self.blocks.point_of_slot)
+        filled = self.blocks.filled.to(points)[:, None]
+        sizes = self.blocks.sizes().clamp_min(1)
+        self.centres = self.blocks.transposed_matmul(filled, self.centred)[:, 0] / sizes[:, None]
+        self.means = self.centres if affine else torch.zeros_like(self.centres)
+        if affine:
+            views = self.blocks.by_bucket(self.centred)
+            for bucket, rows in zip(self.blocks.buckets, views, strict=True):
+                rows -= self.centres[bucket.clusters, None]
+        self.centred[~self.blocks.filled] = 0.0
+        for _ in range(steps):
+            products = self.blocks.matmul(self.centred, vectors)
+            vectors = _orthonormal(self.blocks.transposed_matmul(self.centred, products))
+        self.vectors = vectors
+
+    def spread(self) -> Float[Tensor, "slots"]:
+        """Squared distance of each slot's point to its cluster's mean."""
+        return torch.linalg.vector_norm(self.centred, dim=1).square()
+
+    def squares(self) -> Float[Tensor, "clusters rank"]:
+        """Squared singular values as the vectors see them, falling; turns the vectors to fit."""
+        scale = float(self.centred.abs().max()) or 1.0
+        products = self.blocks.matmul(self.centred / scale, self.vectors)
+        inner = self.blocks.transposed_matmul(products, products).double()
+        with one_thread():
+            values, turn = torch.linalg.eigh(inner)
+        self.vectors = self.vectors @ turn.flip(2).to(self.vectors)
+        return values.flip(1).clamp_min(0.0) * scale**2
+
+    def reassign(
+        self, num_candidates: int, price: Float[Tensor, "clusters"] | None = None
+    ) -> tuple[Int[Tensor, "points"], Float[Tensor, "points"]]:
+        """The best cluster of each point among those nearest to its own; none is left empty.
+
+        Args:
+            num_candidates: How many clusters are near.
+            price: What a point pays beside its error for being in each cluster.
+
+        Returns:
+            New labels, and what each point loses there.
+        """
+        distances = torch.cdist(self.centres, self.centres)
+        distances.fill_diagonal_(-1.0)  # its own first
+        count = min(num_candidates, self.num_clusters)
+        nearest = distances.topk(count, largest=False).indices
+        best = torch.empty_like(self.centred[:, 0])
+        label = torch.empty_like(self.blocks.point_of_slot)
+        for clusters, slots in self._chunks(count):
+            losses = self._losses(clusters, slots, nearest[clusters])
+            if price is not None:
+                losses += price[nearest[clusters]][:, None]
+            least, choice = losses.min(dim=2)
+            best[slots] = least.flatten()
+            label[slots] = nearest[clusters].gather(1, choice).flatten()
+        best += self.spread()
+        labels, errors = self.blocks.to_points(label), self.blocks.to_points(best)
+        return refill(labels, errors, self.num_clusters), errors
+
+    def _chunks(self, count: int) -> Iterator[tuple[slice, slice]]:
+        """Runs of clusters and their slots whose tables of products and of vectors stay small."""
+        columns = count * (self.vectors.shape[2] + 1)
+        for bucket in self.blocks.buckets:
+            elements = columns * max(bucket.size, self.vectors.shape[1])
+            step = max(1, _CHUNK_ELEMENTS // elements)
+            for start in range(0, bucket.num_clusters, step):
+                stop = min(start + step, bucket.num_clusters)
+                first = bucket.first_slot
+                yield (
+                    slice(bucket.first_cluster + start, bucket.first_cluster + stop),
+                    slice(first + start * bucket.size, first + stop * bucket.size),
+                )
+
+    def _losses(
+        self, clusters: slice, slots: slice, candidates: Int[Tensor, "clusters c"]
+    ) -> Float[Tensor, "clusters size c"]:
+        """Squared error of each point in each candidate cluster, less its own spread.
+
+        With y the point less its own mean, δ the candidate's mean less its own, v the candidate's
+        vectors: ``|y-δ|² - Σ (y·v - δ·v)² = |y|² - 2 y·δ + |δ|² - Σ (y·v - δ·v)²``.
+        """
+        shift = (self.means[candidates] - self.means[clusters, None]).mT  # clusters d c
+        vectors = self.vectors[candidates].permute(0, 2, 3, 1)  # clusters d rank c
+        rows = self.centred[slots].view(len(candidates), -1, self.centred.shape[1])
+        offsets = -(vectors * shift[:, :, None]).sum(1).flatten(1)
+        explained = torch.baddbmm(offsets[:, None], rows, vectors.flatten(2))
+        explained = explained.unflatten(2, vectors.shape[2:]).square_().sum(2)
+        lengths = shift.square().sum(1)[:, None]
+        return torch.baddbmm(lengths, rows, shift, alpha=-2.0).sub_(explained)
+
+
+def _orthonormal(vectors: Float[Tensor, "clusters d rank"]) -> Float[Tensor, "clusters d rank"]:
+    """Orthonormal columns with the same span; zero columns stay harmless unit vectors."""
+    scale = vectors.abs().amax((1, 2), keepdim=True)
+    with one_thread():
+        return torch.linalg.qr(vectors / torch.where(scale > 0, scale, 1.0))[0]
