@@ -211,8 +211,8 @@ def _facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
             "cached": made["visibility_cached"]
             and made["projection_cached"]
             and bounces.get("cached", True),
-            "bounces": bounces.get("added", []),
-            "material_unresolved": made["unresolved"] if made["unresolved"] > RESOLVED else None,
+            **({"bounces": bounces["added"]} if bounces else {}),
+            **({"unresolved": made["unresolved"]} if made["unresolved"] > RESOLVED else {}),
         },
         "raw_bytes": transfer.num_bytes,
     }

@@ -35,7 +35,7 @@ def sky_share(mesh: Mesh, points, **options) -> torch.Tensor:
     transfer = bake(mesh, light_basis=SphericalHarmonics(2), **options)
     light = torch.zeros(1, 4, 3)
     light[0, 0] = UNIT_SKY
-    return dense_radiance(transfer, light)[0, points, 0] / 0.8  # the default albedo
+    return dense_radiance(transfer, light)[0, 0, points, 0] / 0.8  # the default albedo
 
 
 def ring_point(vertices: list, faces: list, at, normal_towards) -> int:

@@ -209,7 +209,7 @@ BAD_LIGHTS: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
 }
 
 BAD_CONFIGURATIONS = {
-    "unknown key": (["sceen.mesh=m.obj"], "sceen.mesh", "expected one of scene, light"),
+    "unknown key": (["sceen.mesh=m.obj"], "sceen.mesh", "expected one of scene, material, light"),
     "unknown nested key": (["scene.mash=m.obj"], "scene.mash", "expected one of mesh, ground"),
     "unknown representation": (["representation=spca"], "representation", "expected one of"),
     "unknown in a list": (["representations=[spca]"], "representations", "expected one of"),
@@ -326,6 +326,7 @@ class TestWholeRun:
             "radiance_error",
             "condition",
             "relight_seconds",
+            "coherence",
             "dense_seconds",
             "peak_bytes",
         }

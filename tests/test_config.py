@@ -14,7 +14,7 @@ from prt_torch.representations import CPCA
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 COMPLETE = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
-GROUPS = ("scene", "light", "transfer", "representation", "fit", "preview")
+GROUPS = ("scene", "material", "light", "transfer", "representation", "fit", "preview")
 IN_GROUPS = sorted((path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yaml"))
 REPRESENTATIONS = sorted(stem for group, stem in IN_GROUPS if group == "representation")
 
@@ -176,9 +176,9 @@ class TestRefusals:
         ("argument", "key", "choices"),
         [
             ("rank=3", "rank", "representation, representations, fit"),
-            ("hydra.run.dir=x", "hydra.run.dir", "scene, light, transfer"),
-            ("+more=3", "more", "scene, light, transfer"),
-            ("scene@x=procedural", "scene@x", "scene, light, transfer"),
+            ("hydra.run.dir=x", "hydra.run.dir", "scene, material, light, transfer"),
+            ("+more=3", "more", "scene, material, light, transfer"),
+            ("scene@x=procedural", "scene@x", "scene, material, light, transfer"),
             ("representation.rang=3", "representation.rang", "name, num_clusters, rank, method"),
             ("+scene.colour=3", "scene.colour", "albedo"),
             ("representations=[{name:cpca,rang:3}]", "representations.0.rang", "rank"),

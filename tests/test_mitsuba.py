@@ -73,7 +73,7 @@ def test_direct_light_agrees(assets):
     coefficients, image = smooth_light()
     ours = dense_radiance(
         bake(mesh, light_basis=SphericalHarmonics(4)), coefficients[None].float()
-    )[0].numpy()
+    )[0, 0].numpy()
     # The same light through our own image projection: checks orientation end to end.
     projected = SphericalHarmonics(4).project(
         Environment("smooth", torch.from_numpy(image), "latlong")

@@ -7,14 +7,15 @@ Radiosity is a sum over samples p of the surface, and radiance is the same in ev
 with the dipole's :math:`R_d` (:mod:`prt_torch.assets.medium`). Transfer of an uncoloured diffuse
 surface is :math:`E / \pi`, so the sum maps transfer to transfer, coefficient by coefficient.
 
-*Samples* are the pieces of faces that are bisected until none is longer than a mean free path, up
-to a number. Where :math:`R_d` varies over a piece, it is not sampled at the piece's centroid but
-integrated over the triangle, exactly: the integral over a triangle is a sum over its edges of the
-disk's closed form, averaged over the angle that an edge sweeps. So no scale loses or makes energy;
-a medium that is opaque at the scale of the mesh reflects :math:`R\,E / \pi` of its own point.
+*Samples* (:mod:`prt_torch.baking.surface_samples`) are pieces of faces, at most a mean free path
+long if there are not too many. Where :math:`R_d` varies over a piece, it is integrated over the
+triangle. So no scale loses or makes energy; a medium that is opaque at the scale of the mesh
+reflects :math:`R\,E / \pi` of its own point.
 
-*Far samples* are summed by the nodes of an octree, a node standing for its samples where it is
-small as seen from the point.
+*Far samples* are summed by the nodes of an octree (:mod:`prt_torch.baking.octree`), a node standing
+for its samples where it is small as seen from the point. Neighbouring points traverse the tree
+together: a node has to be small for the least distance of their bounding box. The sum is then a
+product of dense matrices, points by nodes and nodes by coefficients.
 
 *Fresnel* transmission is that of the closed form: irradiance enters whole, and the boundary acts
 through the dipole's A alone, so that uniform light E on a half-space leaves as B = R E. Jensen and
@@ -35,30 +36,32 @@ Source:
 """
 
 import math
-from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
-from torch.nn import functional
 
 from prt_torch.assets.medium import Dipole, Medium
 from prt_torch.assets.mesh import Mesh
 from prt_torch.assets.mesh_geometry import face_geometry
+from prt_torch.baking.octree import build_octree, morton_codes
+from prt_torch.baking.reflectance_table import ReflectanceTable
+from prt_torch.baking.surface_samples import (
+    SurfaceSamples,
+    TriangleMeans,
+    sample_faces,
+)
 from prt_torch.errors import InputError
 
-_MAX_SAMPLES = 2**16  # unless there are more faces
-_PIECES_PER_FACE = 16  # on average: irradiance is linear over a face anyway
 _MAX_ACCURACY = 0.05  # nodes stay farther than what is integrated over triangles
 _NEAR = 0.1  # squared length of a sample over squared distance from which it is integrated
-_MAX_MILLIMETRES = 1e12  # distances in float32 stay far from their limit
-_LEAF = 4  # samples that are not divided further
-_LEVELS = 16  # of the octree
-_PAIRS_AT_ONCE = 2**20  # of points and nodes: some 200 MB
-_TRIANGLES_AT_ONCE = 2**14  # of points and near samples: some 100 MB
-_TABLE_ELEMENTS = 2**27  # of the samples' irradiance: 512 MiB in float32
-_NODES, _NODE_WEIGHTS = map(torch.from_numpy, np.polynomial.legendre.leggauss(8))
+_MAX_MILLIMETRES = 1e12  # cubes of distances in float32 stay within its range
+_GROUP = 32  # points that traverse the octree together
+_RUN = 128  # rows of a group that are multiplied at once
+_TRIANGLES_AT_ONCE = 2**12  # of points and near samples, likewise
+_PAIRS_AT_ONCE = 2**16  # of points and rows: what stays in the processor's cache
+_LIST_ELEMENTS = 2**20  # of groups and rows: some 200 MB
+_TABLE_ELEMENTS = 2**27  # of the rows' irradiance: 512 MiB in float32
 
 
 @torch.no_grad()
@@ -99,30 +102,20 @@ def scatter(
     faces = mesh.faces.to(irradiance.device)
     if points is not None:
         faces = faces[points.to(faces.device)[faces].all(dim=1)]
-    spacing = 1 / float(medium.extinction().max())
-    samples = _sample_faces(vertices, faces, spacing)
-    table_channels = irradiance.shape[1]
-    channels = max(table_channels, len(dipole.reduced_albedo))
+    samples = sample_faces(vertices, faces, spacing=1 / float(medium.extinction().max()))
+    channels = max(irradiance.shape[1], len(dipole.reduced_albedo))
     radiance = irradiance.new_zeros(mesh.num_points, channels, 1, irradiance.shape[2])
     if not samples.num:
         return radiance
     receivers = samples.vertices.unique()
-    # Neighbours in space share nodes, and nodes share the processor's cache.
-    receivers = receivers[_morton_codes(vertices[receivers]).argsort()]
-    completion = _full_turns(vertices, faces)[:, None, None].to(irradiance.dtype)
-    octree = _build_octree(samples) if accuracy > 0 else None
-    columns = max(1, _TABLE_ELEMENTS // (samples.num * table_channels))
+    receivers = receivers[morton_codes(vertices[receivers]).argsort(stable=True)]
+    completion = _full_turns(vertices, faces)[receivers, None, None].to(irradiance.dtype)
+    scene = _Scene(samples, dipole.to(irradiance), accuracy)
+    columns = max(1, _TABLE_ELEMENTS // (scene.num_rows * irradiance.shape[1]))
     for first in range(0, irradiance.shape[2], columns):
         some = irradiance[:, :, first : first + columns]
-        table = samples.interpolate(some)
-        if octree is None:
-            scene = _Direct(samples, table)
-        else:
-            scene = _Hierarchical(samples, table, octree, accuracy)
-        for block in receivers.split(scene.receivers_at_once):
-            own = some[block] * completion[block]
-            total = scene.gather(vertices[block], own, dipole, channels)
-            radiance[block, :, 0, first : first + columns] = total
+        total = scene.gather(vertices[receivers], some[receivers] * completion, scene.table(some))
+        radiance[receivers, :, 0, first : first + columns] = total
     return radiance
 
 
@@ -173,391 +166,151 @@ def _full_turns(
     return torch.where(around > 0, 2 * math.pi / around.clamp_min(1e-30), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """Pieces of faces, all lengths in millimetres."""
+class _Scene:
+    """Rows to sum over, namely samples, then nodes of the octree, then one that is nothing."""
 
-    corners: Float64[Tensor, "samples 3 3"]
-    vertices: Int64[Tensor, "samples 3"]
-    """Of the face that a sample is part of."""
-    barycentric: Float64[Tensor, "samples 3"]
-    """Where the centroid is in that face."""
-    areas: Float64[Tensor, "samples"]
-    normals: Float64[Tensor, "samples 3"]
+    def __init__(self, samples: SurfaceSamples, dipole: Dipole, accuracy: float):
+        self._samples = samples
+        self._accuracy = accuracy
+        self._channels = len(dipole.reduced_albedo)
+        corners = samples.corners.flatten(0, 1)
+        diagonal = corners.amax(dim=0) - corners.amin(dim=0)
+        self._reflectance = ReflectanceTable(dipole, float(diagonal.square().sum()))
+        self._near_means = TriangleMeans(samples, dipole, self._reflectance)
+        self._octree = build_octree(samples.centroids)
+        self.num_rows = samples.num + self._octree.num_nodes + 1
+        areas = samples.areas[:, None]
+        node_centroids = self._octree.sums(samples.centroids * areas) / self._octree.sums(areas)
+        # Nothing is in the middle of all.
+        self._centroids = torch.cat([samples.centroids, node_centroids, node_centroids[:1]])
+        # Neither nodes nor nothing are integrated over a triangle.
+        self._squared_lengths = dipole.depths.new_zeros(self.num_rows)
+        self._squared_lengths[: samples.num] = samples.squared_lengths
+        self._areas = samples.areas.to(dipole.depths)
+        high = self._octree.highest(samples.corners.amax(dim=1))
+        low = -self._octree.highest(-samples.corners.amin(dim=1))
+        # The area of a square whose diagonal is the box's.
+        self._node_sizes = (high - low).square().sum(dim=-1) / 2
+        self._softening = float(dipole.depths.min()) ** 2
 
-    @property
-    def num(self) -> int:
-        return len(self.areas)
-
-    @property
-    def centroids(self) -> Float64[Tensor, "samples 3"]:
-        return self.corners.mean(dim=1)
-
-    @property
-    def squared_lengths(self) -> Float64[Tensor, "samples"]:
-        """Of the longest edge."""
-        return _squared_edges(self.corners).amax(dim=1)
-
-    def interpolate(
-        self, values: Float[Tensor, "points channels coeffs"]
-    ) -> Float[Tensor, "channels samples coeffs"]:
-        """Values at the centroids, linear over each face."""
-        shares = self.barycentric.to(values.dtype)
-        by_channel = values.transpose(0, 1)
-        table = values.new_zeros(values.shape[1], self.num, values.shape[2])
-        for corner in range(3):
-            table += by_channel[:, self.vertices[:, corner]] * shares[:, corner, None]
+    def table(
+        self, irradiance: Float[Tensor, "points channels coeffs"]
+    ) -> Float[Tensor, "channels rows coeffs"]:
+        """Flux of each row over π: irradiance times area."""
+        num, num_nodes = self._samples.num, self._octree.num_nodes
+        table = irradiance.new_zeros(irradiance.shape[1], self.num_rows, irradiance.shape[2])
+        for channel, values in zip(table, irradiance.unbind(1), strict=True):
+            flux = self._samples.fluxes(values)
+            channel[:num] = flux
+            channel[num : num + num_nodes] = self._octree.sums(flux)
         return table
 
-
-def _squared_edges(corners: Float64[Tensor, "samples 3 3"]) -> Float64[Tensor, "samples 3"]:
-    """From each corner to the next."""
-    return (corners.roll(-1, dims=1) - corners).square().sum(dim=-1)
-
-
-def _sample_faces(
-    vertices: Float64[Tensor, "points 3"], faces: Int64[Tensor, "faces 3"], spacing: float
-) -> _Samples:
-    """Bisect faces at their longest edges, the longest first, until none exceeds the spacing.
-
-    Bisection turns slivers into compact pieces. Areas are kept; faces without one are dropped.
-    """
-    corners = vertices[faces]
-    barycentric = torch.eye(3, dtype=vertices.dtype, device=vertices.device).repeat(
-        len(faces), 1, 1
-    )
-    owners = torch.arange(len(faces), device=faces.device)
-    bound = max(len(faces), min(_PIECES_PER_FACE * len(faces), _MAX_SAMPLES))
-    while 0 < len(owners) < bound:
-        edges = _squared_edges(corners)
-        longest = edges.amax(dim=1)
-        divided = longest > max(spacing**2, float(longest.max()) / 4)
-        order = longest.masked_fill(~divided, 0.0).argsort(descending=True, stable=True)
-        chosen = order[: min(int(divided.sum()), bound - len(owners))]
-        if not len(chosen):
-            break
-        kept = torch.ones_like(divided)
-        kept[chosen] = False
-        # Turned so that the longest edge goes from corner 0 to corner 1.
-        turn = (edges[chosen].argmax(dim=1, keepdim=True) + torch.arange(3, device=kept.device)) % 3
-        pieces = [
-            torch.cat([whole[kept], *_bisect(whole[chosen[:, None], turn])])
-            for whole in (corners, barycentric)
-        ]
-        corners, barycentric = pieces
-        owners = torch.cat([owners[kept], owners[chosen], owners[chosen]])
-    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double_areas = cross.norm(dim=-1)
-    solid = double_areas > 0
-    return _Samples(
-        corners=corners[solid],
-        vertices=faces[owners[solid]],
-        barycentric=barycentric[solid].mean(dim=1),
-        areas=double_areas[solid] / 2,
-        normals=cross[solid] / double_areas[solid, None],
-    )
-
-
-def _bisect(corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Both halves of triangles cut from the middle of edge 0-1 to corner 2."""
-    a, b, c = corners.unbind(1)
-    middle = (a + b) / 2
-    return torch.stack([a, middle, c], dim=1), torch.stack([middle, b, c], dim=1)
-
-
-def _integrate_triangles(
-    dipole: Dipole,
-    offsets: Float64[Tensor, "pairs 3 3"],
-    normals: Float64[Tensor, "pairs 3"],
-) -> Float64[Tensor, "pairs channels"]:
-    """Integral of the reflectance over triangles.
-
-    With the foot of the point in the triangle's plane as centre, each edge sweeps an angle; the
-    part of the plane between foot and edge is made of slices of disks that reach to the edge. Parts
-    of edges that face the foot from outside count negative.
-
-    Args:
-        dipole: In float64.
-        offsets: The triangle's corners from the point.
-        normals: Of the triangles.
-    """
-    following = offsets.roll(-1, dims=1)
-    edges = following - offsets
-    lengths = edges.norm(dim=-1)
-    height = (offsets[:, 0] * normals).sum(dim=-1)
-    side = (torch.linalg.cross(offsets, following) * normals[:, None]).sum(dim=-1) / lengths
-    along = (offsets * edges).sum(dim=-1) / lengths
-    reach = side.abs()
-    start = torch.atan2(along, reach)
-    swept = torch.atan2(along + lengths, reach) - start
-    middle_angles = (_NODES.to(offsets) + 1) / 2
-    radius = reach[..., None] / torch.cos(start[..., None] + swept[..., None] * middle_angles)
-    slices = dipole.disk_reflectance(radius, height[:, None, None])  # pairs, edges, nodes, channels
-    mean = torch.einsum("penc,n->pec", slices, _NODE_WEIGHTS.to(offsets) / 2)
-    return (mean * (side.sign() * swept / (2 * math.pi))[..., None]).sum(dim=1).clamp_min(0.0)
-
-
-def _near_weights(
-    samples: _Samples,
-    dipole: Dipole,
-    positions: Float64[Tensor, "pairs 3"],
-    chosen: Int64[Tensor, "pairs"],
-) -> tuple[Float64[Tensor, "pairs channels"], Float64[Tensor, "pairs channels"]]:
-    """What near samples weigh at the sample, and at the point itself.
-
-    A sample that has the point as a corner is lit there as the point is; what it sends comes from
-    in between, from the mean distance of the light's origin within the sample.
-    """
-    offsets = samples.corners[chosen] - positions[:, None]
-    weights = _integrate_triangles(dipole, offsets, samples.normals[chosen])
-    touching = (offsets == 0).all(dim=-1).any(dim=-1)
-    distance = offsets[touching].mean(dim=1).norm(dim=-1)
-    # From a corner, the centroid is at two thirds of the way to the opposite edge.
-    share = dipole.mean_distance(1.5 * distance) / distance[:, None]
-    own = torch.zeros_like(weights)
-    own[touching] = weights[touching] * (1 - share)
-    return weights - own, own
-
-
-class _Direct:
-    """The sum over every sample: the ground truth, and quickest for few samples."""
-
-    def __init__(self, samples: _Samples, table: Float[Tensor, "channels samples coeffs"]):
-        self._samples = samples
-        self._table = table
-        self.receivers_at_once = max(1, _PAIRS_AT_ONCE // samples.num)
-
     def gather(
         self,
         positions: Float64[Tensor, "receivers 3"],
         own: Float[Tensor, "receivers channels coeffs"],
-        dipole: Dipole,
-        channels: int,
+        table: Float[Tensor, "channels rows coeffs"],
     ) -> Float[Tensor, "receivers out_channels coeffs"]:
         """Radiance at points whose own irradiance, made up to a full turn, is ``own``."""
-        samples = self._samples
-        squared = (positions[:, None] - samples.centroids).square().sum(dim=-1)
-        weights = dipole.reflectance(squared.sqrt()) * samples.areas[:, None]
-        near = _is_near(samples.squared_lengths, squared, dipole)
-        local = weights.new_zeros(len(positions), weights.shape[-1])
-        receiver, sample = near.nonzero(as_tuple=True)
-        rows = zip(
-            receiver.split(_TRIANGLES_AT_ONCE), sample.split(_TRIANGLES_AT_ONCE), strict=True
-        )
-        for some, chosen in rows:
-            away, own_share = _near_weights(samples, dipole, positions[some], chosen)
-            weights[some, chosen] = away
-            local.index_add_(0, some, own_share)
-        total = own.new_zeros(len(positions), channels, own.shape[-1])
-        for out, of_table, of_weights in _channel_pairs(channels, own.shape[1], weights.shape[-1]):
-            total[:, out] = weights[..., of_weights].to(own.dtype) @ self._table[of_table]
-            total[:, out] += local[:, of_weights, None].to(own.dtype) * own[:, of_table]
-        return total
+        num = len(positions)
+        num_groups = math.ceil(num / _GROUP)
+        # The last group is filled up with its last point.
+        filled = torch.arange(num_groups * _GROUP, device=positions.device).clamp_max(num - 1)
+        grouped = positions[filled].unflatten(0, (num_groups, _GROUP))
+        # At 5 percent, a group has some 1000 rows; one list holds the longest of any level.
+        most = self._samples.num
+        if self._accuracy > 0:
+            most = min(most, math.ceil(64 / self._accuracy))
+        totals, locals_ = [], []
+        for groups in grouped.split(max(1, _LIST_ELEMENTS // most)):
+            total, local = self._gather_groups(groups, table)
+            totals.append(total)
+            locals_.append(local)
+        total, local = torch.cat(totals, dim=1)[:, :num], torch.cat(locals_, dim=1)[:, :num]
+        for out, of_table, of_medium in _channel_pairs(len(total), len(table), len(local)):
+            total[out] += local[of_medium, :, None] * own[:, of_table]
+        return total.transpose(0, 1)
 
-
-class _Hierarchical:
-    """The sum over the nodes of an octree where they are small as seen from the point."""
-
-    def __init__(
+    def _gather_groups(
         self,
-        samples: _Samples,
-        table: Float[Tensor, "channels samples coeffs"],
-        octree: "_Octree",
-        accuracy: float,
-    ):
-        self._samples = samples
-        self._table = table
-        self._octree = octree
-        self._accuracy = accuracy
-        areas = samples.areas[:, None]
-        self._centroids = octree.sums(samples.centroids * areas) / octree.sums(areas)
-        high = octree.highest(samples.corners.amax(dim=1))
-        low = -octree.highest(-samples.corners.amin(dim=1))
-        # The area of a square whose diagonal is the box's.
-        self._sizes = (high - low).square().sum(dim=-1) / 2
-        weighted = (octree.sums(channel * areas.to(table.dtype)) for channel in table)
-        self._node_table = torch.stack(list(weighted))
-        # A level has some 4 pi / accuracy nodes that are neither small enough nor in a small one.
-        pairs_per_receiver = min(samples.num, math.ceil(16 / accuracy))
-        self.receivers_at_once = max(1, _PAIRS_AT_ONCE // pairs_per_receiver)
+        grouped: Float64[Tensor, "groups members 3"],
+        table: Float[Tensor, "channels rows coeffs"],
+    ) -> tuple[
+        Float[Tensor, "out_channels receivers coeffs"], Float[Tensor, "medium_channels receivers"]
+    ]:
+        """The sum over rows, and the weights of the points' own light."""
+        group, rows = self._runs(grouped)
+        channels = max(len(table), self._channels)
+        total = table.new_zeros(channels, *grouped.shape[:2], table.shape[2])
+        local = table.new_zeros(self._channels, grouped.shape[0] * _GROUP)
+        at_once = max(1, _PAIRS_AT_ONCE // (_GROUP * _RUN))
+        for some, row in zip(group.split(at_once), rows.split(at_once), strict=True):
+            weights = self._weights(grouped, some, row, local)
+            fluxes = table[:, row]
+            pairs = _channel_pairs(channels, len(table), len(weights))
+            for out, of_table, of_medium in pairs:
+                total[out].index_add_(0, some, torch.bmm(weights[of_medium], fluxes[of_table]))
+        return total.flatten(1, 2), local
 
-    def gather(
+    def _runs(
+        self, grouped: Float64[Tensor, "groups members 3"]
+    ) -> tuple[Int64[Tensor, "runs"], Int64[Tensor, "runs rows"]]:
+        """Groups, and the rows each sees, in runs of one length that are filled up with nothing."""
+        low, high = grouped.amin(dim=1), grouped.amax(dim=1)
+        nodes = self._centroids[self._samples.num :]
+
+        def small_enough(group: Tensor, node: Tensor) -> Tensor:
+            centroid = nodes[node]
+            beside = torch.maximum(low[group] - centroid, centroid - high[group]).clamp_min_(0.0)
+            squared = beside.square_().sum(dim=-1)
+            return self._node_sizes[node] <= self._accuracy * (squared + self._softening)
+
+        group, row = self._octree.select(len(grouped), small_enough)
+        count = torch.bincount(group, minlength=len(grouped))
+        num_runs = (count + _RUN - 1) // _RUN
+        place = torch.arange(len(group), device=group.device)
+        place -= torch.repeat_interleave(count.cumsum(0) - count, count)
+        place += torch.repeat_interleave((num_runs.cumsum(0) - num_runs) * _RUN, count)
+        group_of_run = torch.repeat_interleave(num_runs)
+        rows = row.new_full((len(group_of_run), _RUN), self.num_rows - 1)
+        rows.view(-1)[place] = row
+        return group_of_run, rows
+
+    def _weights(
         self,
-        positions: Float64[Tensor, "receivers 3"],
-        own: Float[Tensor, "receivers channels coeffs"],
-        dipole: Dipole,
-        channels: int,
-    ) -> Float[Tensor, "receivers out_channels coeffs"]:
-        """Radiance at points whose own irradiance, made up to a full turn, is ``own``."""
-        octree = self._octree
-        total = own.new_zeros(len(positions), channels, own.shape[-1])
-        softening = float(dipole.depths.min()) ** 2
-        receiver = torch.arange(len(positions), device=positions.device)
-        node = torch.zeros_like(receiver)
-        while len(node):
-            squared = (positions[receiver] - self._centroids[node]).square_().sum(dim=-1)
-            whole = self._sizes[node] <= self._accuracy * (squared + softening)
-            weights = dipole.to(own).reflectance(squared[whole].to(own.dtype).sqrt_())
-            _accumulate(total, self._node_table, receiver[whole], node[whole], weights)
-            receiver, node = receiver[~whole], node[~whole]
-            is_leaf = octree.num_children[node] == 0
-            leaf = node[is_leaf]
-            runs = octree.first_sample[leaf], octree.num_samples[leaf]
-            samples = _expand(receiver[is_leaf], *runs)
-            self._add_samples(total, own, dipole, positions, *samples)
-            inner = node[~is_leaf]
-            children = octree.first_child[inner], octree.num_children[inner]
-            receiver, node = _expand(receiver[~is_leaf], *children)
-        return total
-
-    def _add_samples(
-        self,
-        total: Float[Tensor, "receivers out_channels coeffs"],
-        own: Float[Tensor, "receivers channels coeffs"],
-        dipole: Dipole,
-        positions: Float64[Tensor, "receivers 3"],
-        receiver: Int64[Tensor, "pairs"],
-        chosen: Int64[Tensor, "pairs"],
-    ) -> None:
-        samples = self._samples
-        sample = self._octree.order[chosen]
-        squared = (positions[receiver] - samples.centroids[sample]).square_().sum(dim=-1)
-        weights = dipole.reflectance(squared.sqrt()) * samples.areas[sample, None]
-        near = _is_near(samples.squared_lengths[sample], squared, dipole).nonzero()[:, 0]
-        for some in near.split(_TRIANGLES_AT_ONCE):
-            away, local = _near_weights(samples, dipole, positions[receiver[some]], sample[some])
-            weights[some] = away
-            # A point's own light is a table with one row a point.
-            table = own.transpose(0, 1)
-            _accumulate(total, table, receiver[some], receiver[some], local.to(own.dtype))
-        _accumulate(total, self._table, receiver, sample, weights.to(own.dtype))
-
-
-def _is_near(squared_lengths: Tensor, squared: Tensor, dipole: Dipole) -> Tensor:
-    """Whether the reflectance varies over a sample, seen from a squared distance."""
-    return squared_lengths > _NEAR * (squared + float(dipole.depths.min()) ** 2)
-
-
-def _channel_pairs(channels: int, of_table: int, of_weights: int) -> list[tuple[int, int, int]]:
-    """Each channel of the result with its channel of irradiance and of the medium."""
-    return [(out, min(out, of_table - 1), min(out, of_weights - 1)) for out in range(channels)]
-
-
-def _accumulate(
-    total: Float[Tensor, "receivers out_channels coeffs"],
-    table: Float[Tensor, "channels rows coeffs"],
-    receiver: Int64[Tensor, "pairs"],
-    row: Int64[Tensor, "pairs"],
-    weights: Float[Tensor, "pairs medium_channels"],
-) -> None:
-    """Add weighted rows to their receivers, which are in ascending order."""
-    if not len(row):
-        return
-    borders = torch.arange(len(total) + 1, device=receiver.device)
-    borders = torch.searchsorted(receiver, borders)
-    for out, of_table, of_weights in _channel_pairs(
-        total.shape[1], table.shape[0], weights.shape[1]
-    ):
-        total[:, out] += functional.embedding_bag(
-            row,
-            table[of_table],
-            borders,
-            mode="sum",
-            per_sample_weights=weights[:, of_weights].contiguous(),
-            include_last_offset=True,
-        )
-
-
-def _expand(
-    receiver: Int64[Tensor, "nodes"], first: Int64[Tensor, "nodes"], count: Int64[Tensor, "nodes"]
-) -> tuple[Int64[Tensor, "pairs"], Int64[Tensor, "pairs"]]:
-    """Each receiver with each number of its run ``first .. first + count - 1``."""
-    skipped = torch.repeat_interleave(count.cumsum(0) - count - first, count)
-    steps = torch.arange(len(skipped), device=first.device)
-    return torch.repeat_interleave(receiver, count), steps - skipped
-
-
-def _morton_codes(positions: Float64[Tensor, "points 3"]) -> Int64[Tensor, "points"]:
-    """Cells of 2^16 along each axis of the bounding cube, numbered along the octree's curve."""
-    low = positions.amin(dim=0)
-    extent = float((positions - low).max()) or 1.0
-    cells = ((positions - low) * (2**_LEVELS / extent)).long().clamp(0, 2**_LEVELS - 1)
-    codes = torch.zeros_like(cells[:, 0])
-    for bit in range(_LEVELS):
+        grouped: Float64[Tensor, "groups members 3"],
+        group: Int64[Tensor, "runs"],
+        row: Int64[Tensor, "runs rows"],
+        local: Float[Tensor, "medium_channels receivers"],
+    ) -> list[Float[Tensor, "runs members rows"]]:
+        """Reflectance of each pair, by channel; adds up what points weigh themselves."""
+        centres = grouped[group].mean(dim=1, keepdim=True)
+        points = (grouped[group] - centres).to(local)
+        centroids = (self._centroids[row] - centres).to(local)
+        squared = torch.zeros((), dtype=local.dtype, device=local.device)
         for axis in range(3):
-            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return codes
+            difference = points[:, :, None, axis] - centroids[:, None, :, axis]
+            squared = squared + difference.square_()
+        lengths = self._squared_lengths[row][:, None]
+        near = lengths > _NEAR * (squared + self._softening)
+        close = near & (lengths > squared)
+        weights = self._reflectance(squared)
+        for place, is_close in ((near & ~close, False), (close, True)):
+            for some in place.flatten().nonzero()[:, 0].split(_TRIANGLES_AT_ONCE):
+                item, column = some // _RUN, some % _RUN
+                run = item // _GROUP
+                sample, receiver = row[run, column], group[run] * _GROUP + item % _GROUP
+                position = grouped.flatten(0, 1)[receiver]
+                if is_close:
+                    means, own = self._near_means.over_close(position, sample)
+                    local.index_add_(1, receiver, own * self._areas[sample])
+                else:
+                    means = self._near_means.over_far(position, sample)
+                for channel, values in zip(weights, means, strict=True):
+                    channel.view(-1)[some] = values
+        return weights
 
 
-@dataclass(frozen=True, eq=False)
-class _Octree:
-    """Nodes in order of their levels, the root first; children of a node follow each other."""
-
-    order: Int64[Tensor, "samples"]
-    """Samples along the curve, where a node's are a run."""
-    leaf_of: Int64[Tensor, "samples"]
-    """By place on the curve."""
-    levels: list[slice]
-    parent: Int64[Tensor, "nodes"]
-    first_child: Int64[Tensor, "nodes"]
-    num_children: Int64[Tensor, "nodes"]
-    first_sample: Int64[Tensor, "nodes"]
-    num_samples: Int64[Tensor, "nodes"]
-
-    def sums(self, values: Float[Tensor, "samples columns"]) -> Float[Tensor, "nodes columns"]:
-        """Sums over the samples of each node."""
-        sums = values.new_zeros(len(self.parent), values.shape[1])
-        sums.index_add_(0, self.leaf_of, values[self.order])
-        for level in reversed(self.levels[1:]):
-            sums.index_add_(0, self.parent[level], sums[level].clone())
-        return sums
-
-    def highest(
-        self, values: Float64[Tensor, "samples columns"]
-    ) -> Float64[Tensor, "nodes columns"]:
-        """Largest values among the samples of each node."""
-        highest = values.new_full((len(self.parent), values.shape[1]), -math.inf)
-        _raise_to(highest, self.leaf_of, values[self.order])
-        for level in reversed(self.levels[1:]):
-            _raise_to(highest, self.parent[level], highest[level].clone())
-        return highest
-
-
-def _raise_to(highest: Tensor, rows: Int64[Tensor, "values"], values: Tensor) -> None:
-    """Replace elements by larger ones."""
-    highest.scatter_reduce_(0, rows[:, None].expand_as(values), values, "amax")
-
-
-def _build_octree(samples: _Samples) -> _Octree:
-    """Divide nodes of more than a few samples, along the curve, level by level."""
-    codes, order = _morton_codes(samples.centroids).sort(stable=True)
-    leaf_of = torch.zeros_like(order)
-    first_sample, num_samples, parent, levels = [], [], [], []
-    first_node = 0
-    inside = torch.arange(len(codes), device=codes.device)  # nodes that are still to be divided
-    for level in range(_LEVELS + 1):
-        prefix = codes[inside] >> (3 * (_LEVELS - level))
-        node, count = torch.unique_consecutive(prefix, return_inverse=True, return_counts=True)[1:]
-        start = inside[count.cumsum(0) - count]
-        first_sample.append(start)
-        num_samples.append(count)
-        parent.append(leaf_of[start])
-        leaf_of[inside] = node + first_node
-        levels.append(slice(first_node, first_node + len(count)))
-        first_node += len(count)
-        inside = inside[count[node] > _LEAF]
-        if not len(inside):
-            break
-    parents = torch.cat(parent)
-    # Children follow in the order of their parents, so a node's begin where its predecessors' end.
-    num_children = torch.bincount(parents[1:], minlength=first_node)
-    return _Octree(
-        order=order,
-        leaf_of=leaf_of,
-        levels=levels,
-        parent=parents,
-        first_child=num_children.cumsum(0) - num_children + 1,
-        num_children=num_children,
-        first_sample=torch.cat(first_sample),
-        num_samples=torch.cat(num_samples),
-    )
+def _channel_pairs(channels: int, of_table: int, of_medium: int) -> list[tuple[int, int, int]]:
+    """Each channel of the result with its channel of irradiance and of the medium."""
+    return [(out, min(out, of_table - 1), min(out, of_medium - 1)) for out in range(channels)]

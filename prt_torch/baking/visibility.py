@@ -83,9 +83,8 @@ class Tracer:
         self._directions = np.ascontiguousarray(directions)
         self._by_axis = np.ascontiguousarray(directions.T)
         self.num_bytes = len(directions) // 8
-        self.trace(
-            range(1)
-        )  # Embree builds its hierarchy on the first query, not safely from two threads
+        # Embree builds its hierarchy on the first query, not safely from two threads.
+        self.occluded(self._origins[:1], self._directions[:1])
 
     def rays(self, point: int) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions of the rays of one point, ``"rays 3"`` each."""

@@ -33,6 +33,7 @@ _TURNS_PER_RANK = 6
 _LAST_TURNS = 16
 _FEW_MOVES = 2e-3  # share of points; below it a turn ends a rank
 _IGNORED = 0.05  # share of the error that the axes left out may hold
+_FEW_AXES = 64  # fewer save no time
 _CHUNK_ELEMENTS = 2**21  # of one table of products; larger ones cost more for their memory
 
 
@@ -58,7 +59,7 @@ class PrincipalAxes:
     def enough(self, error: float, least: int) -> int:
         """How many axes leave out a small part of this error; at least so many."""
         matter = int((self.beyond > _IGNORED * error).sum()) + 1
-        return min(max(matter, least), self.axes.shape[1])
+        return min(max(matter, least, _FEW_AXES), self.axes.shape[1])
 
     def leading(self, count: int) -> Float[Tensor, "points count"]:
         """The points in the first axes."""
