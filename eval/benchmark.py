@@ -2,10 +2,10 @@
 
 python eval/benchmark.py [--mesh=FILE] [--quick]
 
-Prints three tables: rays against Embree's own any-hit rate, CPCA against scikit-learn's k-means
-and PCA, and relighting against the uncompressed product and against the floor that memory
-bandwidth and arithmetic set. Everything compared is measured in turn in the same process; times
-are medians.
+Prints tables: rays against Embree's own any-hit rate, CPCA against scikit-learn's k-means and
+PCA, and relighting against the uncompressed product and against the floor that memory bandwidth
+and arithmetic set; diffuse, and glossy with 24 exit functions. Everything compared is measured in
+turn in the same process; times are medians.
 """
 
 import os
@@ -28,16 +28,21 @@ from torch import Tensor
 
 from prt_torch import evaluate
 from prt_torch.assets import Mesh, concatenate, ground_plane, load_mesh, procedural_scene
+from prt_torch.assets.brdf import AshikhminShirley
+from prt_torch.assets.material import Material
 from prt_torch.baking import bake
 from prt_torch.baking.visibility import Tracer
 from prt_torch.bases import SphericalHarmonics
 from prt_torch.command import main
 from prt_torch.errors import InputError
+from prt_torch.metric import Metric
 from prt_torch.relight import Relighter
 from prt_torch.representations import CPCA, DenseTransfer
 from prt_torch.transfer import TransferTensor
 
-CLUSTERS, RANK = 256, 4
+CLUSTERS, RANK, GLOSSY_RANK = 256, 4, 8
+MOST_CLUSTERS = 2048
+BRUSHED = AshikhminShirley(specular=0.7, diffuse=0.0, exponent_u=10.0, exponent_v=60.0)
 RESOLUTION, SUPERSAMPLING = 32, 2
 LIGHTS = (1, 16, 64)
 ORDERS = (6, 10)
@@ -70,12 +75,16 @@ def benchmark(arguments: list[str]) -> None:
     console.print(f"bake at {RESOLUTION}x{SUPERSAMPLING}: peak memory of the process {peak}")
     console.print(bench_encoding(tensors, rounds=1 if quick else 3))
     console.print(bench_relighting(tensors, bandwidth, rate, rounds=rounds))
+    glossy = baked(mesh, 5, {mesh.parts[0].name: Material(lambertian=False, glossy=BRUSHED)})
+    console.print(bench_glossy_encoding(glossy))
+    console.print(bench_glossy_relighting(glossy, bandwidth, rate, rounds=rounds))
 
 
-def baked(mesh: Mesh, order: int) -> TransferTensor:
+def baked(mesh: Mesh, order: int, materials: dict[str, Material] | None = None) -> TransferTensor:
     """Transfer of a scene, from bits traced once."""
     return bake(
         mesh,
+        materials=materials,
         light_basis=SphericalHarmonics(order),
         resolution=RESOLUTION,
         supersampling=SUPERSAMPLING,
@@ -193,20 +202,97 @@ def our_cpca(transfer: TransferTensor, method: Any) -> Tensor:
         return model.dense().flatten(1)
 
 
-def sklearn_cpca(data: Tensor) -> Tensor:
+def sklearn_cpca(data: Tensor, clusters: int = CLUSTERS, rank: int = RANK) -> Tensor:
     """The same by scikit-learn: k-means once, then a PCA of each cluster."""
     points = data.numpy()
-    kmeans = KMeans(CLUSTERS, n_init=1, random_state=0)  # pyright: ignore[reportArgumentType]
+    kmeans = KMeans(clusters, n_init=1, random_state=0)  # pyright: ignore[reportArgumentType]
     labels = kmeans.fit_predict(points)
     out = np.empty_like(points)
-    for cluster in range(CLUSTERS):
+    for cluster in range(clusters):
         own = points[labels == cluster]
-        if len(own) <= RANK:
+        if len(own) <= rank:
             out[labels == cluster] = own
             continue
-        pca = PCA(RANK).fit(own)
+        pca = PCA(rank).fit(own)
         out[labels == cluster] = pca.inverse_transform(pca.transform(own))
     return torch.from_numpy(out)
+
+
+def bench_glossy_encoding(transfer: TransferTensor) -> Table:
+    """Iterative CPCA of glossy transfer, and scikit-learn with clusters raised to its error.
+
+    Both minimise, and are compared in, the L2 norm that weighs rows by their Gram matrix.
+    """
+    size = transfer.num_rows * transfer.num_coeffs
+    title = f"Glossy encoding, {transfer.num_points} points x {size} values, rank {GLOSSY_RANK}"
+    table = Table(title=title, title_justify="left")
+    for column in ("method", "clusters", "seconds", "MiB", "squared error"):
+        table.add_column(column, justify="right")
+    weighed = Metric.l2(transfer).weigh(transfer.dense()).flatten(1)
+    norm = float(weighed.double().square().sum())
+    start = time.perf_counter()
+    model = CPCA.from_transfer(transfer, num_clusters=CLUSTERS, rank=GLOSSY_RANK)
+    taken = time.perf_counter() - start
+    goal = evaluate.transfer_error(model, transfer)
+    num_bytes = sum(model.storage().values()) / 2**20
+    table.add_row("ours", str(CLUSTERS), f"{taken:.1f}", f"{num_bytes:.2f}", f"{goal:.3e}")
+    clusters, error = CLUSTERS, float("inf")
+    while error > goal and clusters <= MOST_CLUSTERS:
+        start = time.perf_counter()
+        found = sklearn_cpca(weighed, clusters, GLOSSY_RANK)
+        taken = time.perf_counter() - start
+        error = float((found.double() - weighed).square().sum()) / norm
+        floats = transfer.num_points * GLOSSY_RANK + clusters * (GLOSSY_RANK + 1) * size
+        num_bytes = (4 * floats + 2 * transfer.num_points) / 2**20
+        cells = (str(clusters), f"{taken:.1f}", f"{num_bytes:.2f}", f"{error:.3e}")
+        table.add_row("sklearn KMeans + PCA", *cells)
+        clusters *= 2
+    return table
+
+
+def bench_glossy_relighting(
+    transfer: TransferTensor, bandwidth: float, rate: float, rounds: int
+) -> Table:
+    """Exit functions of glossy transfer, and radiance towards one view."""
+    size = f"{transfer.num_rows} x {transfer.num_coeffs}"
+    title = f"Glossy relighting, {size}, {CLUSTERS} clusters, rank {GLOSSY_RANK}; milliseconds"
+    table = Table(title=title, title_justify="left")
+    products = ("dense", "CPCA", "faster", "dense, view", "CPCA, view", "faster")
+    for column in ("lights", *products, "floor", "bound by", "of floor", "peak"):
+        table.add_column(column, justify="right")
+    model = CPCA.from_transfer(transfer, num_clusters=CLUSTERS, rank=GLOSSY_RANK)
+    dense = DenseTransfer.from_transfer(transfer)
+    view = torch.tensor([[3.0, 2.0, 4.0]])
+    for lights in LIGHTS[:2]:
+        light = torch.randn(lights, transfer.num_coeffs, 3)
+        with torch.no_grad():
+            seconds = evaluate.median_seconds(
+                [
+                    partial(dense, light),
+                    partial(model, light),
+                    partial(Relighter(dense), light, view),
+                    partial(Relighter(model), light, view),
+                ],
+                rounds=rounds,
+                warm_up=3,
+            )
+            peak = evaluate.peak_bytes(partial(model, light))
+        floor, bound = relighting_floor(model, lights, bandwidth, rate)
+        plain, ours, plain_view, our_view = (taken * 1e3 for taken in seconds)
+        table.add_row(
+            str(lights),
+            f"{plain:.2f}",
+            f"{ours:.2f}",
+            f"{plain / ours:.2f}x",
+            f"{plain_view:.2f}",
+            f"{our_view:.2f}",
+            f"{plain_view / our_view:.2f}x",
+            f"{floor * 1e3:.2f}",
+            bound,
+            f"{floor * 1e3 / ours:.2f}",
+            f"{peak / 2**20:.1f} MiB",
+        )
+    return table
 
 
 def bench_relighting(
@@ -255,11 +341,11 @@ def bench_relighting(
 
 def relighting_floor(model: CPCA, lights: int, bandwidth: float, rate: float) -> tuple[float, str]:
     """The larger of bytes over bandwidth and operations over rate, and which of them it is."""
-    columns = 3 * lights
+    columns = 3 * lights * model.num_rows
     vectors = model.num_clusters * (model.rank + 1)
     operations = 2 * columns * (vectors * model.num_coeffs + model.num_points * (model.rank + 1))
     result = 4 * columns * model.num_points
-    moved = sum(model.storage().values()) + 4 * columns * model.num_coeffs + result
+    moved = sum(model.storage().values()) + 12 * lights * model.num_coeffs + result
     by_bytes, by_operations = moved / bandwidth, operations / rate
     return max(by_bytes, by_operations), "memory" if by_bytes > by_operations else "arithmetic"
 

@@ -81,7 +81,7 @@ def repeat(arguments: list[str]) -> None:
         if "8" in wanted:
             rows = {n: baked(materials=glossy, light_basis=light, num_rows=n) for n in (16, 25)}
             rows[64] = baked(materials=glossy, light_basis=light, num_rows=64)
-            console.print(figure_8(rows))
+            console.print(figure_8(rows, mesh))
 
 
 def figure_3(transfer: TransferTensor) -> Table:
@@ -169,7 +169,7 @@ def figure_5(transfer: TransferTensor, mesh: Mesh) -> Table:
     return table
 
 
-def figure_8(tensors: dict[int, TransferTensor]) -> Table:
+def figure_8(tensors: dict[int, TransferTensor], mesh: Mesh) -> Table:
     """Rows of exit functions: what 16 and 25 lose of 64, and what relighting them costs.
 
     Zero-hemisphere coefficients are the Gram matrix times the least-squares ones.
@@ -177,12 +177,11 @@ def figure_8(tensors: dict[int, TransferTensor]) -> Table:
     table = Table(title="Figures 7 and 8: rows of glossy transfer", title_justify="left")
     for column in ("rows", "radiance error", "zero-hemisphere", "dense ms", "CPCA 256x8 ms"):
         table.add_column(column, justify="right")
-    reference, views = tensors[64], None
+    reference, positions = tensors[64], mesh.vertices.float()
     light = torch.stack([SphericalHarmonics(5).project(find_environment("sunset"))]).float()
     directions = torch.randn(8, 3, generator=torch.Generator().manual_seed(0))
-    positions = reference.surface.positions
     reach = float((positions - positions.mean(0)).norm(dim=1).max())
-    views = positions.mean(0).float() + 3 * reach * torch.nn.functional.normalize(directions, dim=1)
+    views = positions.mean(0) + 3 * reach * torch.nn.functional.normalize(directions, dim=1)
     seen = evaluate.seen_from(reference.surface, views)[..., None].float()
     truth = evaluate.dense_radiance(reference, light, views)[0] * seen
     for count in (16, 25):

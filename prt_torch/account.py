@@ -1,6 +1,5 @@
 """A run's account of itself: errors, bytes, times, pictures and what was left out."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch import evaluate, gallery, store
-from prt_torch.assets import Environment, Mesh
-from prt_torch.assets.material import Material
+from prt_torch.assets import Mesh
 from prt_torch.baking import RESOLVED
-from prt_torch.bases import LightBasis
 from prt_torch.config import PreviewConfig
+from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.report import write_html
@@ -27,29 +25,6 @@ PICTURES = "pictures"  # folder of them inside a run folder
 _ALL_BUT_ONE = 24  # functions of order 5 without the best replaced one
 _VIEWS = 6  # around the scene, that errors of glossy transfer are averaged over
 _DENSE_BLOCK_POINTS = 2000  # timed and scaled up when the whole tensor does not fit
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Everything a run reads, loaded and validated before anything is written."""
-
-    mesh: Mesh
-    materials: Mapping[str, Material]
-    fit_lights: list[Environment]
-    test_lights: list[Environment]
-    light_basis: LightBasis
-
-    @property
-    def material(self) -> str:
-        """What the parts of the scene are made of, in a few words."""
-        return ", ".join(f"{part}: {_words(made_of)}" for part, made_of in self.materials.items())
-
-
-def _words(material: Material) -> str:
-    words = ["Lambertian"] if material.lambertian else []
-    words += [str(material.glossy.describe()["name"])] if material.glossy else []
-    words += ["translucent"] if material.medium else []
-    return " + ".join(words) or "black"
 
 
 @dataclass(frozen=True)

@@ -16,25 +16,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from prt_torch import store
-from prt_torch.account import PICTURES, Fitted, Inputs, write_report
-from prt_torch.assets import (
-    Environment,
-    Mesh,
-    concatenate,
-    find_environment,
-    ground_plane,
-    load_mesh,
-    procedural_scene,
-)
-from prt_torch.assets.brdf import brdf
-from prt_torch.assets.material import Material
-from prt_torch.assets.medium import PRESETS
-from prt_torch.baking import RESOLVED, bake, check_memory
-from prt_torch.bases import CubeDirections, LightBasis, SphericalHarmonics
-from prt_torch.config import PartConfig, RepresentationConfig, RunConfig
+from prt_torch.account import PICTURES, Fitted, write_report
+from prt_torch.assets import Mesh
+from prt_torch.baking import RESOLVED, bake
+from prt_torch.config import RepresentationConfig, RunConfig
 from prt_torch.errors import InputError
 from prt_torch.fitting import fit
 from prt_torch.gallery import file_name
+from prt_torch.inputs import Inputs, load_inputs
 from prt_torch.metric import Metric
 from prt_torch.report import summary_table
 from prt_torch.representations import CPCA, load, save
@@ -121,80 +110,10 @@ def _identity(config: RunConfig) -> dict[str, Any]:
 
 
 def _load(config: RunConfig) -> Inputs:
-    scene, light = config.scene, config.light
-    if scene.mesh is None:
-        mesh = procedural_scene()
-    else:
-        mesh = load_mesh(
-            scene.mesh,
-            up=scene.up,
-            transform=scene.transform,
-            orientation=scene.orientation,
-            albedo=scene.albedo,
-        )
-        if scene.ground:
-            ground = ground_plane(mesh, size=scene.ground_size, resolution=scene.ground_resolution)
-            mesh = concatenate([mesh, ground], mesh.name)
-
-    def find(names: list[str]) -> list[Environment]:
-        return [
-            find_environment(
-                name,
-                layout=light.layout,
-                rotation_degrees=light.rotation_degrees,
-                exposure=light.exposure,
-            )
-            for name in names
-        ]
-
-    basis = _light_basis(config)
-    inputs = Inputs(mesh, _materials(config, mesh), find(light.fit), find(light.test), basis)
-    if config.fit.metric == "light_prior" and not inputs.fit_lights:
-        raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
-    names = [file_name(environment.name) for environment in inputs.test_lights]
-    if len(set(names)) != len(names):
-        raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
     results = [_name(wanted) for wanted in config.fitted]
     if len(set(results)) != len(results):
         raise InputError(f"representations: expected different ones, got {', '.join(results)}")
-    fine = config.transfer.resolution * config.transfer.supersampling
-    check_memory(inputs.light_basis, fine, config.memory_budget)
-    return inputs
-
-
-def _materials(config: RunConfig, mesh: Mesh) -> dict[str, Material]:
-    """The material of each part: the object's for all but the ground, unless named."""
-    scene, names = config.material, [part.name for part in mesh.parts]
-    unknown = [name for name in scene.parts if name not in names]
-    if unknown:
-        raise InputError(
-            f"material.parts: no part {unknown[0]!r}; expected one of {', '.join(names)}"
-        )
-    own = _material("material", scene)
-    others = {name: _material(f"material.parts.{name}", at) for name, at in scene.parts.items()}
-    return {name: others.get(name, Material() if name == "ground" else own) for name in names}
-
-
-def _material(key: str, wanted: PartConfig) -> Material:
-    medium = None
-    if wanted.medium is not None:
-        if wanted.medium not in PRESETS:
-            choices = ", ".join(PRESETS)
-            raise InputError(f"{key}.medium: unknown {wanted.medium!r}; expected one of {choices}")
-        medium = PRESETS[wanted.medium]
-    try:
-        glossy = None if wanted.glossy is None else brdf(wanted.glossy)
-    except InputError as error:
-        raise InputError(f"{key}.glossy: {error}") from error
-    return Material(wanted.lambertian, glossy, medium, wanted.millimetres_per_unit)
-
-
-def _light_basis(config: RunConfig) -> LightBasis:
-    match config.transfer.light_basis:
-        case "sh":
-            return SphericalHarmonics(config.transfer.order)
-        case "cube":
-            return CubeDirections(config.transfer.resolution)
+    return load_inputs(config)
 
 
 def _claim(config: RunConfig, inputs: Inputs) -> str:

@@ -247,8 +247,8 @@ def test_adding_transfers():
     assert torch.allclose(shared.dense(), 2 * rows)
     with pytest.raises(ValueError, match="same points"):
         add([glossy, TransferTensor.from_dense(torch.zeros(5, 4))])
+    four = TransferTensor.from_dense(rows[:, :, :4], exit_basis=HemisphericalHarmonics(4))
     with pytest.raises(ValueError, match="one exit basis"):
-        four = TransferTensor.from_dense(rows[:, :, :4], exit_basis=HemisphericalHarmonics(4))
         add([glossy, four])
 
 

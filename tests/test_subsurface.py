@@ -11,7 +11,10 @@ from scipy.integrate import quad
 from prt_torch.assets import concatenate, mesh_from_arrays
 from prt_torch.assets.medium import PRESETS, Medium
 from prt_torch.assets.mesh import Mesh
+from prt_torch.baking.octree import build_octree
+from prt_torch.baking.reflectance_table import ReflectanceTable
 from prt_torch.baking.subsurface import scatter
+from prt_torch.baking.surface_samples import TriangleMeans, sample_faces
 from prt_torch.errors import InputError
 
 PRINTED = {  # diffuse reflectance, Jensen et al. 2001, figure 5
@@ -200,6 +203,80 @@ def test_hierarchical_is_direct(scale):
     exact = scatter(mesh, light, PRESETS["marble"], accuracy=0, **options)
     error = float((fast - exact).norm() / exact.norm())
     assert 0 < error < 1e-2
+
+
+def test_many_points_at_once():
+    """Several groups and blocks, in float32 and float64, against a sum over sub-triangles."""
+    mesh = sphere(3)
+    light = (mesh.normals[:, :1] + 1)[:, None]
+    scale = 5.0
+    radiance = scatter(mesh, light, PRESETS["skin1"], millimetres_per_unit=scale)
+    single = scatter(mesh, light.float(), PRESETS["skin1"], millimetres_per_unit=scale)
+    torch.testing.assert_close(single.double(), radiance, rtol=1e-4, atol=1e-6)
+    vertices = mesh.vertices * scale
+    corners, values = vertices[mesh.faces], light[:, 0, 0][mesh.faces]
+    for _ in range(3):  # each triangle into 4
+        swap = torch.tensor([1, 2, 0])
+        corners, values = (
+            torch.cat(
+                [
+                    torch.stack([x[:, 0], m[:, 0], m[:, 2]], 1),
+                    torch.stack([x[:, 1], m[:, 1], m[:, 0]], 1),
+                    torch.stack([x[:, 2], m[:, 2], m[:, 1]], 1),
+                    m,
+                ]
+            )
+            for x, m in ((x, (x + x[:, swap]) / 2) for x in (corners, values))
+        )
+    edges = corners[:, 1:] - corners[:, :1]
+    flux = torch.linalg.cross(*edges.unbind(1)).norm(dim=-1) / 2 * values.mean(dim=1)
+    for point in range(0, mesh.num_points, 97):
+        distance = (corners.mean(dim=1) - vertices[point]).norm(dim=-1)
+        expected = flux @ PRESETS["skin1"].diffuse_reflectance(distance)
+        torch.testing.assert_close(radiance[point, :, 0, 0], expected, rtol=1e-2, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_reflectance_table(dtype):
+    dipole = PRESETS["marble"].dipole()
+    squared = torch.cat([torch.zeros(1), torch.logspace(-8, 2.5, 2000)]).to(dtype)
+    found = ReflectanceTable(dipole.to(squared), 400.0)(squared)
+    expected = dipole.reflectance(squared.double().sqrt())
+    torch.testing.assert_close(torch.stack(found, -1).double(), expected, rtol=5e-5, atol=0)
+
+
+def test_octree_shows_every_point_once():
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(4)).double()
+    points[100:120] = points[100]  # cannot be divided
+    octree = build_octree(points)
+    viewer, row = octree.select(3, lambda who, node: octree.num_points[node] <= 40 * who)
+    values = torch.rand(500, 2, generator=torch.Generator().manual_seed(5)).double()
+    rows = torch.cat([values, octree.sums(values)])
+    for who in range(3):
+        seen = row[viewer == who]
+        torch.testing.assert_close(rows[seen].sum(dim=0), values.sum(dim=0))
+    assert sorted(row[viewer == 0].tolist()) == list(range(500))
+    assert len(row[viewer == 2]) < 100
+    torch.testing.assert_close(octree.highest(points)[0], points.amax(dim=0))
+
+
+def test_triangle_means():
+    """Closed forms and three points against each other, from half a triangle's length on."""
+    medium = PRESETS["apple"]
+    dipole = medium.dipole()
+    mesh = sphere(1)
+    samples = sample_faces(mesh.vertices * 2, mesh.faces, 1e3)
+    means = TriangleMeans(samples, dipole, ReflectanceTable(dipole, 100.0))
+    sample = torch.arange(samples.num)
+    tilted = samples.normals + torch.randn(
+        samples.num, 3, generator=torch.Generator().manual_seed(6)
+    )
+    for distance, bound in ((1.0, 2e-2), (2.0, 4e-3), (4.0, 3e-3)):
+        length = samples.squared_lengths.sqrt()[:, None] * distance
+        positions = samples.centroids + torch.nn.functional.normalize(tilted, dim=1) * length
+        close, own = means.over_close(positions, sample)
+        assert not own.any()
+        assert float((means.over_far(positions, sample) - close).norm() / close.norm()) < bound
 
 
 def test_scale_and_translation():

@@ -58,8 +58,8 @@ _NEAR = 0.1  # squared length of a sample over squared distance from which it is
 _MAX_MILLIMETRES = 1e12  # cubes of distances in float32 stay within its range
 _GROUP = 32  # points that traverse the octree together
 _RUN = 128  # rows of a group that are multiplied at once
+_PAIRS_AT_ONCE = 2**17  # of points and rows: what stays in the processor's cache
 _TRIANGLES_AT_ONCE = 2**12  # of points and near samples, likewise
-_PAIRS_AT_ONCE = 2**16  # of points and rows: what stays in the processor's cache
 _LIST_ELEMENTS = 2**20  # of groups and rows: some 200 MB
 _TABLE_ELEMENTS = 2**27  # of the rows' irradiance: 512 MiB in float32
 
@@ -170,6 +170,7 @@ class _Scene:
     """Rows to sum over, namely samples, then nodes of the octree, then one that is nothing."""
 
     def __init__(self, samples: SurfaceSamples, dipole: Dipole, accuracy: float):
+        self._softening = float(dipole.depths.min()) ** 2
         self._samples = samples
         self._accuracy = accuracy
         self._channels = len(dipole.reduced_albedo)
@@ -184,14 +185,14 @@ class _Scene:
         # Nothing is in the middle of all.
         self._centroids = torch.cat([samples.centroids, node_centroids, node_centroids[:1]])
         # Neither nodes nor nothing are integrated over a triangle.
-        self._squared_lengths = dipole.depths.new_zeros(self.num_rows)
-        self._squared_lengths[: samples.num] = samples.squared_lengths
+        self._squared_lengths = samples.squared_lengths.to(dipole.depths)
+        self._near_squared = dipole.depths.new_full((self.num_rows,), -1.0)
+        self._near_squared[: samples.num] = samples.squared_lengths / _NEAR - self._softening
         self._areas = samples.areas.to(dipole.depths)
         high = self._octree.highest(samples.corners.amax(dim=1))
         low = -self._octree.highest(-samples.corners.amin(dim=1))
         # The area of a square whose diagonal is the box's.
         self._node_sizes = (high - low).square().sum(dim=-1) / 2
-        self._softening = float(dipole.depths.min()) ** 2
 
     def table(
         self, irradiance: Float[Tensor, "points channels coeffs"]
@@ -246,7 +247,9 @@ class _Scene:
         at_once = max(1, _PAIRS_AT_ONCE // (_GROUP * _RUN))
         for some, row in zip(group.split(at_once), rows.split(at_once), strict=True):
             weights = self._weights(grouped, some, row, local)
-            fluxes = table[:, row]
+            fluxes = [
+                channel.index_select(0, row.flatten()).unflatten(0, row.shape) for channel in table
+            ]
             pairs = _channel_pairs(channels, len(table), len(weights))
             for out, of_table, of_medium in pairs:
                 total[out].index_add_(0, some, torch.bmm(weights[of_medium], fluxes[of_table]))
@@ -285,29 +288,27 @@ class _Scene:
     ) -> list[Float[Tensor, "runs members rows"]]:
         """Reflectance of each pair, by channel; adds up what points weigh themselves."""
         centres = grouped[group].mean(dim=1, keepdim=True)
-        points = (grouped[group] - centres).to(local)
-        centroids = (self._centroids[row] - centres).to(local)
-        squared = torch.zeros((), dtype=local.dtype, device=local.device)
-        for axis in range(3):
-            difference = points[:, :, None, axis] - centroids[:, None, :, axis]
-            squared = squared + difference.square_()
-        lengths = self._squared_lengths[row][:, None]
-        near = lengths > _NEAR * (squared + self._softening)
-        close = near & (lengths > squared)
+        points = (grouped[group] - centres).to(local).movedim(2, 0).contiguous()
+        centroids = (self._centroids[row] - centres).to(local).movedim(2, 0).contiguous()
+        squared = (points[0, :, :, None] - centroids[0, :, None]).square_()
+        for axis in (1, 2):
+            squared += (points[axis, :, :, None] - centroids[axis, :, None]).square_()
         weights = self._reflectance(squared)
-        for place, is_close in ((near & ~close, False), (close, True)):
-            for some in place.flatten().nonzero()[:, 0].split(_TRIANGLES_AT_ONCE):
-                item, column = some // _RUN, some % _RUN
-                run = item // _GROUP
-                sample, receiver = row[run, column], group[run] * _GROUP + item % _GROUP
-                position = grouped.flatten(0, 1)[receiver]
-                if is_close:
-                    means, own = self._near_means.over_close(position, sample)
-                    local.index_add_(1, receiver, own * self._areas[sample])
-                else:
-                    means = self._near_means.over_far(position, sample)
-                for channel, values in zip(weights, means, strict=True):
-                    channel.view(-1)[some] = values
+        near = (squared < self._near_squared[row][:, None]).flatten().nonzero()[:, 0]
+        member, column = near // _RUN, near % _RUN
+        run = member // _GROUP
+        sample, receiver = row[run, column], group[run] * _GROUP + member % _GROUP
+        close = squared.flatten()[near] < self._squared_lengths[sample]
+        positions = grouped.flatten(0, 1)
+        for some in (~close).nonzero()[:, 0].split(_TRIANGLES_AT_ONCE):
+            means = self._near_means.over_far(positions[receiver[some]], sample[some])
+            for channel, values in zip(weights, means, strict=True):
+                channel.view(-1)[near[some]] = values
+        for some in close.nonzero()[:, 0].split(_TRIANGLES_AT_ONCE):
+            means, own = self._near_means.over_close(positions[receiver[some]], sample[some])
+            local.index_add_(1, receiver[some], own * self._areas[sample[some]])
+            for channel, values in zip(weights, means, strict=True):
+                channel.view(-1)[near[some]] = values
         return weights
 
 

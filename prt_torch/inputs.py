@@ -1,0 +1,129 @@
+"""What a run reads: mesh, materials, lights, loaded and validated before anything is written."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from prt_torch.assets import (
+    Environment,
+    Mesh,
+    concatenate,
+    find_environment,
+    ground_plane,
+    load_mesh,
+    procedural_scene,
+)
+from prt_torch.assets.brdf import brdf
+from prt_torch.assets.material import Material
+from prt_torch.assets.medium import PRESETS
+from prt_torch.baking import check_memory
+from prt_torch.bases import CubeDirections, LightBasis, SphericalHarmonics
+from prt_torch.config import LightConfig, PartConfig, RunConfig, SceneConfig
+from prt_torch.errors import InputError
+from prt_torch.gallery import file_name
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything a run reads, loaded and validated before anything is written."""
+
+    mesh: Mesh
+    materials: Mapping[str, Material]
+    fit_lights: list[Environment]
+    test_lights: list[Environment]
+    light_basis: LightBasis
+
+    @property
+    def material(self) -> str:
+        """What the parts of the scene are made of, in a few words."""
+        return ", ".join(f"{part}: {_words(made_of)}" for part, made_of in self.materials.items())
+
+
+def _words(material: Material) -> str:
+    words = ["Lambertian"] if material.lambertian else []
+    words += [str(material.glossy.describe()["name"])] if material.glossy else []
+    words += ["translucent"] if material.medium else []
+    return " + ".join(words) or "black"
+
+
+def load_inputs(config: RunConfig) -> Inputs:
+    """Read everything that a configuration names.
+
+    Raises:
+        InputError: If an input is unusable, or the configuration asks for what cannot be.
+    """
+    mesh, basis = _mesh(config.scene), _light_basis(config)
+    light = config.light
+    inputs = Inputs(
+        mesh, _materials(config, mesh), _lights(light.fit, light), _lights(light.test, light), basis
+    )
+    if config.fit.metric == "light_prior" and not inputs.fit_lights:
+        raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
+    names = [file_name(environment.name) for environment in inputs.test_lights]
+    if len(set(names)) != len(names):
+        raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
+    fine = config.transfer.resolution * config.transfer.supersampling
+    check_memory(basis, fine, config.memory_budget)
+    return inputs
+
+
+def _mesh(scene: SceneConfig) -> Mesh:
+    if scene.mesh is None:
+        return procedural_scene()
+    mesh = load_mesh(
+        scene.mesh,
+        up=scene.up,
+        transform=scene.transform,
+        orientation=scene.orientation,
+        albedo=scene.albedo,
+    )
+    if scene.ground:
+        ground = ground_plane(mesh, size=scene.ground_size, resolution=scene.ground_resolution)
+        mesh = concatenate([mesh, ground], mesh.name)
+    return mesh
+
+
+def _lights(names: Sequence[str], light: LightConfig) -> list[Environment]:
+    return [
+        find_environment(
+            name,
+            layout=light.layout,
+            rotation_degrees=light.rotation_degrees,
+            exposure=light.exposure,
+        )
+        for name in names
+    ]
+
+
+def _materials(config: RunConfig, mesh: Mesh) -> dict[str, Material]:
+    """The material of each part: the object's for all but the ground, unless named."""
+    scene, names = config.material, [part.name for part in mesh.parts]
+    unknown = [name for name in scene.parts if name not in names]
+    if unknown:
+        raise InputError(
+            f"material.parts: no part {unknown[0]!r}; expected one of {', '.join(names)}"
+        )
+    own = _material("material", scene)
+    others = {name: _material(f"material.parts.{name}", at) for name, at in scene.parts.items()}
+    return {name: others.get(name, Material() if name == "ground" else own) for name in names}
+
+
+def _material(key: str, wanted: PartConfig) -> Material:
+    medium = None
+    if wanted.medium is not None:
+        if wanted.medium not in PRESETS:
+            choices = ", ".join(PRESETS)
+            raise InputError(f"{key}.medium: unknown {wanted.medium!r}; expected one of {choices}")
+        medium = PRESETS[wanted.medium]
+    try:
+        glossy = None if wanted.glossy is None else brdf(wanted.glossy)
+    except InputError as error:
+        raise InputError(f"{key}.glossy: {error}") from error
+    return Material(wanted.lambertian, glossy, medium, wanted.millimetres_per_unit)
+
+
+def _light_basis(config: RunConfig) -> LightBasis:
+    match config.transfer.light_basis:
+        case "sh":
+            return SphericalHarmonics(config.transfer.order)
+        case "cube":
+            return CubeDirections(config.transfer.resolution)
