@@ -35,7 +35,13 @@ class Inputs:
     @property
     def material(self) -> str:
         """What the parts of the scene are made of, in a few words."""
-        return ", ".join(f"{part}: {_words(made_of)}" for part, made_of in self.materials.items())
+        parts: dict[str, list[str]] = {}
+        for part, made_of in self.materials.items():
+            parts.setdefault(_words(made_of), []).append(part)
+        return "; ".join(
+            f"{', '.join(names[:3])}{f' and {len(names) - 3} more' if names[3:] else ''}: {words}"
+            for words, names in parts.items()
+        )
 
 
 def _words(material: Material) -> str:

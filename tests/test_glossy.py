@@ -1,6 +1,7 @@
 """Glossy transfer: reflection matrices, matrices of points, materials of a scene, sums."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from prt_torch.assets import concatenate, mesh_from_arrays
 from prt_torch.assets.brdf import GGX, AshikhminShirley, Lambert, Phong, Sum, directional_albedo
 from prt_torch.assets.material import Material, assign_materials
 from prt_torch.assets.medium import PRESETS
+from prt_torch.assets.mesh import Part
 from prt_torch.baking import (
     RESOLVED,
     bake,
@@ -200,6 +202,10 @@ def test_materials_by_part():
     shiny = Material(glossy=PHONG)
     materials, index = assign_materials(scene, {"lid": shiny})
     assert [materials[i] for i in index.tolist()] == [shiny] * 16 + [Material()] * 25 + [shiny] * 9
+    folded = replace(bumpy(3), parts=(Part("left", 0, 9, 0, 3), Part("right", 0, 9, 3, 5)))
+    own = set(folded.faces[3:].reshape(-1).tolist()) - set(folded.faces[:3].reshape(-1).tolist())
+    index = assign_materials(folded, {"right": shiny})[1]
+    assert set(torch.nonzero(index)[:, 0].tolist()) == own  # shared points belong to the first
     with pytest.raises(InputError, match="no part 'door'"):
         assign_materials(scene, {"door": shiny})
     assert assign_materials(scene, None)[0] == [Material()]

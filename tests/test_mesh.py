@@ -730,3 +730,37 @@ def test_real_mesh(assets, name):
     assert {tuple(sorted(f)) for f in mesh.faces.tolist()} == {
         tuple(sorted(f)) for f in other.faces.tolist()
     }
+
+
+class TestGroupsOfAnOBJ:
+    LINES = """
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 2 0 0
+v 2 1 0
+{start}f 1 2 3 4
+{middle}f 2 5 6 3
+f 2 5 6
+"""
+
+    def parts(self, tmp_path, start, middle):
+        path = tmp_path / "groups.obj"
+        path.write_text(self.LINES.format(start=start, middle=middle))
+        mesh = load_mesh(path)
+        return [
+            (p.name, p.first_vertex, p.num_vertices, p.first_face, p.num_faces) for p in mesh.parts
+        ]
+
+    def test_materials(self, tmp_path):
+        found = self.parts(tmp_path, "o all\nusemtl dull red\n", "g ignored\nusemtl shiny\n")
+        assert found == [("dull red", 0, 4, 0, 2), ("shiny", 1, 5, 2, 3)]
+
+    def test_groups_and_objects(self, tmp_path):
+        assert self.parts(tmp_path, "", "g wing\n") == [
+            ("unnamed", 0, 4, 0, 2),
+            ("wing", 1, 5, 2, 3),
+        ]
+        assert self.parts(tmp_path, "o\no body\n", "") == [("body", 0, 6, 0, 5)]
+        assert self.parts(tmp_path, "", "") == [("groups", 0, 6, 0, 5)]

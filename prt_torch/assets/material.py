@@ -35,6 +35,8 @@ def assign_materials(
 ) -> tuple[list[Material], Int[Tensor, "points"]]:
     """The materials of a scene, and which of them each point has.
 
+    A point that faces of several parts share takes the material of the part that is listed first.
+
     Args:
         mesh: The scene.
         materials: One for all points; or some by name of a part of the mesh, the others being
@@ -47,13 +49,14 @@ def assign_materials(
     if materials is None or isinstance(materials, Material):
         return [materials or Material()], index
     found, names = [Material()], [part.name for part in mesh.parts]
+    numbers: dict[str, int] = {}
     for name, material in materials.items():
         if name not in names:
             raise InputError(f"materials: {mesh.name} has no part {name!r}; its parts are {names}")
         if material not in found:
             found.append(material)
-        for part in mesh.parts:
-            if part.name == name:
-                own = slice(part.first_vertex, part.first_vertex + part.num_vertices)
-                index[own] = found.index(material)
+        numbers[name] = found.index(material)
+    for part in reversed(mesh.parts):  # a point that parts share belongs to the first of them
+        faces = mesh.faces[part.first_face : part.first_face + part.num_faces]
+        index[faces.reshape(-1)] = numbers.get(part.name, 0)
     return found, index

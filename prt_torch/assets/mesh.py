@@ -55,7 +55,10 @@ _MESSAGES = {
 
 @dataclass(frozen=True)
 class Part:
-    """A run of vertices and faces that belong together, such as one node of a scene."""
+    """A run of faces that belong together, such as one node of a scene or one group of a file.
+
+    Its vertices lie in a run of their own, which runs of other parts may overlap.
+    """
 
     name: str
     first_vertex: int
@@ -261,7 +264,8 @@ def load_mesh(
     Polygons become fans of triangles. Normals are the file's where a vertex has exactly one
     usable normal, and angle-weighted averages of its faces elsewhere. Vertex colours become the
     albedo, sRGB-decoded but for glTF, whose colours are linear; a point without one gets
-    :data:`DEFAULT_ALBEDO`. STL facets share no points. The parts of a scene are its nodes.
+    :data:`DEFAULT_ALBEDO`. STL facets share no points. The parts of a scene are its nodes,
+    those of an OBJ file its runs of one material, else of one group or object.
 
     Args:
         path: The file; its suffix names the format.
@@ -289,9 +293,15 @@ def load_mesh(
     colours = raw.albedo
     if albedo is not None:
         colours = np.broadcast_to(np.asarray(albedo, np.float64), vertices.shape)
-    # A scene's nodes are triangles already, so its polygons and faces have the same numbers.
+    first_face = np.concatenate([[0], np.cumsum(raw.sizes - 2)])
     parts = tuple(
-        Part(part.name, part.first_vertex, part.num_vertices, part.first_polygon, part.num_polygons)
+        Part(
+            part.name,
+            part.first_vertex,
+            part.num_vertices,
+            first := int(first_face[part.first_polygon]),
+            int(first_face[part.first_polygon + part.num_polygons]) - first,
+        )
         for part in raw.parts
     )
     return _finish(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64
 
 from prt_torch.assets.mesh import Mesh
@@ -35,10 +36,10 @@ class Camera:
         aspect: float = 4 / 3,
         margin: float = 1.3,
     ) -> "Camera":
-        """A camera that shows the whole first part of a mesh, and a little of what is round it.
+        """A camera that shows a whole mesh but for its ground, and a little of what is round it.
 
-        Later parts, such as a ground plane, do not count: the object stays large, and the margin
-        shows the shadow beside it.
+        A part of the name ``ground`` does not count: the object stays large, and the margin shows
+        the shadow beside it.
 
         Args:
             mesh: The scene.
@@ -101,11 +102,14 @@ class Camera:
 
 
 def _framed_points(mesh: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """The points that faces of the first part use; isolated vertices have no say."""
-    first = mesh.parts[0]
-    faces = mesh.faces[first.first_face : first.first_face + first.num_faces]
+    """The points that faces other than the ground's use; isolated vertices have no say."""
+    framed = np.ones(mesh.num_faces, bool)
+    for part in mesh.parts:
+        if part.name == "ground":
+            framed[part.first_face : part.first_face + part.num_faces] = False
+    faces = mesh.faces[torch.from_numpy(framed if framed.any() else ~framed)]
     if len(faces) == 0:
-        raise ValueError(f"{mesh.name}: the first part has no faces to look at")
+        raise ValueError(f"{mesh.name}: there are no faces to look at")
     return mesh.vertices[faces.unique()].numpy()
 
 

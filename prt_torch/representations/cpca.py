@@ -168,6 +168,7 @@ class CPCA(Representation):
             max_error=max_error,
             max_bytes=max_bytes,
             max_relight_seconds=max_relight_seconds,
+            static=method == "static",
             metric=metric,
             generator=generator,
         )

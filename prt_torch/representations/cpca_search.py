@@ -1,8 +1,9 @@
 """How many clusters, and of what rank, for a limit of error, bytes or time.
 
 One clustering by distance for each number of clusters in a ladder gives, by the spectra of its
-clusters, the error at every rank at once. This table of estimates is cheap beside one true
-encoding, of which at most four are made to correct it.
+clusters, the error at every rank at once. Clusters made for their subspaces lose less, the more
+so the higher the rank: a rule of thumb says by how much, and what true encodings are found to lose
+corrects it. At most four of these are made.
 """
 
 import itertools
@@ -27,12 +28,13 @@ from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.transfer import TransferTensor
 
 _MOST_CLUSTERS = 2048
-_MOST_RANKS = 64  # of several clusters; one cluster may have all
+_MOST_RANKS = 24  # of several clusters: more cost more at run time than they are worth
 _MOST_POINTS = 2**16  # looked at for the table
 _STEPS = 8  # between two numbers of clusters of the table
 _ENCODINGS = 4
 _MARGIN = 1.02  # by which an estimate must keep the limit
 _DOUBT = 2.0  # the same, for the last encoding when none has kept it
+_GAIN_RANK = 6.0  # at which clusters made for their subspaces lose half of what others do
 _CALLS = 7  # whose median is the time of a shape
 _BLOCK_BYTES = 2**24
 
@@ -55,6 +57,7 @@ def search(
     max_error: float | None,
     max_bytes: int | None,
     max_relight_seconds: float | None,
+    static: bool,
     metric: Metric,
     generator: torch.Generator,
 ) -> Model:
@@ -67,6 +70,7 @@ def search(
         max_error: Squared error over squared norm in the metric.
         max_bytes: Of storage.
         max_relight_seconds: Of one call for one light.
+        static: Whether true encodings keep the clusters of distance alone.
         metric: What errors are worth.
         generator: Source of randomness.
 
@@ -84,6 +88,11 @@ def search(
         raise InputError(f"expected a finite limit of at least 0, got {limits}")
     attempts = _Attempts(transfer, metric, make)
     table = error_table(transfer, metric, generator)
+    if not static:
+        table = {
+            shape: error / (1.0 + shape.rank / _GAIN_RANK) if shape.num_clusters > 1 else error
+            for shape, error in table.items()
+        }
     if max_error is not None:
         return _least_bytes(_between(table), attempts, max_error)
     if max_bytes is not None:
@@ -235,7 +244,7 @@ def _least_bytes(table: dict[Shape, float], attempts: _Attempts[Model], max_erro
             for shape, error in table.items()
             if shape not in attempts
             and storage_bytes(transfer, shape) < most
-            and (error * ratio * (doubt if turn else 1.0) <= max_error)
+            and error * (ratio if shape.num_clusters > 1 else 1.0) * doubt <= max_error
             and not any(
                 shape.num_clusters <= seen.num_clusters and shape.rank <= seen.rank
                 for seen, (_, lost) in attempts.items()
@@ -249,7 +258,7 @@ def _least_bytes(table: dict[Shape, float], attempts: _Attempts[Model], max_erro
         else:
             shape = min(table, key=lambda shape: (table[shape], storage_bytes(transfer, shape)))
         model, error = attempts[shape]
-        if table[shape] > 0 and error > 0:
+        if table[shape] > 0 and error > 0 and shape.num_clusters > 1:
             ratio = error / table[shape]
         if error <= max_error:
             best = model

@@ -1,4 +1,4 @@
-"""A strict reader of Wavefront OBJ: the lines ``v``, ``vn`` and ``f``, and no others.
+"""A strict reader of Wavefront OBJ: vertices, normals, faces, and the names of groups of faces.
 
 One point per ``v`` line, whatever texture coordinates and normals the corners name. General
 loaders split vertices at texture seams, drop those with NaN and wrap index 0 to the last vertex,
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from prt_torch.assets.mesh_formats.raw import RawMesh, finite_normals, linear_from_srgb
+from prt_torch.assets.mesh_formats.raw import RawMesh, RawPart, finite_normals, linear_from_srgb
 from prt_torch.errors import InputError
 
 # Normals that differ by less are one normal written twice: files keep about six digits.
@@ -39,6 +39,7 @@ class _Lines:
         self.corners: list[int] = []
         self.corner_normals: list[int] = []
         self.sizes: list[int] = []
+        self.groups: dict[bytes, list[tuple[int, str]]] = {b"usemtl": [], b"g": [], b"o": []}
 
     def add(self, words: list[bytes]) -> None:
         """Take in one line; a ValueError says what is wrong with it."""
@@ -55,6 +56,25 @@ class _Lines:
                 self.normals.append(_numbers(words[1:4]))
             case b"f":
                 self._add_face(words[1:])
+            case b"usemtl" | b"g" | b"o":
+                name = b" ".join(words[1:]).decode("utf-8", "replace") or "unnamed"
+                self.groups[words[0]].append((len(self.sizes), name))
+
+    def parts(self) -> tuple[RawPart, ...]:
+        """Runs of faces of one material; of one group or object where no material is named."""
+        starts = next((found for found in self.groups.values() if found), [])
+        if starts and starts[0][0] > 0:
+            starts = [(0, "unnamed"), *starts]
+        ends = [first for first, _ in [*starts[1:], (len(self.sizes), "")]] if starts else []
+        first_corners = np.concatenate([[0], np.cumsum(self.sizes, dtype=np.int64)])
+        parts = []
+        for (first, name), end in zip(starts, ends, strict=True):
+            if end == first:
+                continue
+            used = self.corners[first_corners[first] : first_corners[end]]
+            low, high = max(min(used), 0), max(used)
+            parts.append(RawPart(name, low, high - low + 1, first, end - first))
+        return tuple(parts)
 
     def _add_face(self, words: list[bytes]) -> None:
         if len(words) < 3:
@@ -131,4 +151,5 @@ def read_obj(path: Path, data: bytes) -> RawMesh:
         albedo=None if np.isnan(colours).all() else linear_from_srgb(colours),
         first_index=1,
         split_normals=split,
+        parts=lines.parts(),
     )
