@@ -36,7 +36,9 @@ def test_clusters_move_to_where_they_are_missed():
 def test_the_choice_is_that_of_a_loop(affine):
     generator = torch.Generator().manual_seed(1)
     data = far_groups(affine, generator)[::4]
-    labels, _ = sort_labels(torch.randint(8, (400,), generator=generator), 8)
+    mixed = torch.where(torch.arange(400) % 4 == 0, torch.arange(400) // 4 % 8, -1)
+    group = torch.arange(8).repeat_interleave(50)
+    labels, _ = sort_labels(torch.where(mixed >= 0, mixed, group), 8)
     vectors = torch.randn(8, 12, 2, generator=generator, dtype=torch.float64)
     fit = Subspaces(data, labels, vectors, affine, steps=2)
     choice = fit.choose(8)

@@ -40,6 +40,8 @@ class Outcome:
         relight_seconds: Median time of one relighting [s].
         dense_seconds: The same for the uncompressed tensor [s].
         peak_bytes: Most memory in use while relighting.
+        overdraw: How often a face is drawn, on average, by clusters.
+        overdraw_merged: The same by superclusters.
     """
 
     name: str
@@ -57,6 +59,8 @@ class Outcome:
     relight_seconds: Number
     dense_seconds: Number
     peak_bytes: Number
+    overdraw: Number
+    overdraw_merged: Number
 
     @property
     def ratio(self) -> Number:
@@ -126,6 +130,7 @@ def outcomes(report: Mapping[str, Any]) -> list[Outcome]:
 
 def _outcome(result: Mapping[str, Any], report: Mapping[str, Any]) -> Outcome:
     errors = result.get("radiance_error") or {}
+    coherence = result.get("coherence") or {}
     names = ("condition", "fit_seconds", "bytes", "transfer_error", "reference_error")
     more_names = ("relight_seconds", "dense_seconds", "peak_bytes")
     return Outcome(
@@ -135,6 +140,8 @@ def _outcome(result: Mapping[str, Any], report: Mapping[str, Any]) -> Outcome:
         parameters=parameters_text(result.get("parameters")),
         status=str(result.get("status", "")),
         raw_bytes=number(result.get("raw_bytes", report.get("raw_bytes"))),
+        overdraw=number(coherence.get("overdraw")),
+        overdraw_merged=number(coherence.get("overdraw_merged")),
         radiance_error={str(key): number(value) for key, value in errors.items()},
         **{name: number(result.get(name)) for name in (*names, *more_names)},
     )

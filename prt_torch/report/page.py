@@ -179,11 +179,19 @@ def _facts(run: Run) -> str:
         "time": seconds_text(number(run.bake.get("seconds"))),
         "rays": _count(run.bake.get("rays")),
         "from the cache": "yes" if run.bake.get("cached") else "no",
+        "bounces": _bounces(run.bake.get("bounces")),
     }
     return "".join(
         _fact_card(f"{run.name}: {title}" if run.name else title.capitalize(), facts)
         for title, facts in (("scene", scene), ("light", light), ("bake", bake))
     )
+
+
+def _bounces(added: Any) -> str | None:
+    """How many, and what the last one added; None where none were gathered."""
+    if not added:
+        return None
+    return f"{len(added)}, the last added {error_text(number(added[-1]))} of the light"
 
 
 def _fact_card(title: str, facts: Mapping[str, Any]) -> str:
@@ -208,6 +216,7 @@ class _Cell:
 
 def _results(rows: Sequence[Outcome]) -> str:
     lights = environments(rows)
+    drawn = any(row.overdraw is not None for row in rows)
     headings = [
         ("Name", "text"),
         ("Bytes", ""),
@@ -219,6 +228,7 @@ def _results(rows: Sequence[Outcome]) -> str:
         ("Relight", ""),
         ("Faster", ""),
         ("Peak\nmemory", ""),
+        *((("Overdraw,\nmerged", ""),) if drawn else ()),
         ("Parameters", "text"),
     ]
     cells = [
@@ -233,6 +243,7 @@ def _results(rows: Sequence[Outcome]) -> str:
             _Cell(seconds_text(row.relight_seconds), row.relight_seconds),
             _Cell(factor_text(row.speed_up), row.speed_up),
             _Cell(bytes_text(row.peak_bytes), row.peak_bytes),
+            *((_overdraw_cell(row),) if drawn else ()),
             _Cell(row.parameters, row.parameters, "text wide"),
         ]
         for row in rows
@@ -242,9 +253,16 @@ def _results(rows: Sequence[Outcome]) -> str:
 <p class="note">Bytes count everything needed to relight. Transfer error is squared error over
 squared norm of the uncompressed tensor; reference error the same against the bake at full
 resolution, so it compares across light bases. Radiance error is the relative root mean square under
-lights that took no part in the fit. Smaller and faster are against the uncompressed tensor, on the
-same machine in the same run. A click on a heading sorts.</p></section>
+lights that took no part in the fit. Overdraw is how often a face is drawn, by clusters and by
+clusters merged into what 256 registers hold. Smaller and faster are against the uncompressed
+tensor, on the same machine in the same run. A click on a heading sorts.</p></section>
 """
+
+
+def _overdraw_cell(row: Outcome) -> _Cell:
+    if row.overdraw is None or row.overdraw_merged is None:
+        return _Cell("–", None)
+    return _Cell(f"{row.overdraw:.2f}, {row.overdraw_merged:.2f}", row.overdraw)
 
 
 def _percent_cell(value: Number) -> _Cell:
