@@ -85,14 +85,14 @@ def test_exploding_steps_end_nonfinite_and_keep_the_best():
 def test_resumption_is_bit_identical(tmp_path, optimizer, dtype):
     transfer = random_transfer(points=150, dtype=dtype)
     whole = disturbed(transfer)
-    fit(whole, transfer, optimizer=optimizer, max_steps=9, tolerance=0.0)
+    fit(whole, transfer, optimizer=optimizer, max_steps=6, tolerance=0.0)
     path = tmp_path / "fit.checkpoint"
-    for steps in (2, 5, 9):
+    for steps in (2, 4, 6):
         model = disturbed(transfer)
         result = fit(
             model, transfer, optimizer=optimizer, max_steps=steps, tolerance=0.0, checkpoint=path
         )
-    assert result.steps == 9
+    assert result.steps == 6
     for a, b in zip(whole.parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b)
 
