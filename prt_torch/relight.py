@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from prt_torch.bases import Radiance
 from prt_torch.representations import Representation
 
+_ROWS_BYTES = 2**24  # of exit rows between two steps: more leave the cache and need fresh memory
+
 
 class Relighter(nn.Module):
     """Radiance of every point under distant light.
@@ -64,9 +66,10 @@ class Relighter(nn.Module):
         """
         if not isinstance(light, Tensor):
             light = self.project(light)
-        radiance_bytes = 3 * self.representation.num_points * self.representation.num_rows
-        at_once = max(1, self._max_bytes // (radiance_bytes * light.dtype.itemsize))
         rows = self._view_rows(views, frames)
+        radiance_bytes = 3 * self.representation.num_points * self.representation.num_rows
+        most = self._max_bytes if rows is None else min(self._max_bytes, _ROWS_BYTES)
+        at_once = max(1, most // (radiance_bytes * light.dtype.itemsize))
         if len(light) <= at_once:
             return self._relight(light, rows, frames)
         return torch.cat([self._relight(some, rows, frames) for some in light.split(at_once)])
@@ -80,7 +83,9 @@ class Relighter(nn.Module):
         if rows is None:
             radiance = radiance[:, None, :, 0]
         else:
-            radiance = torch.einsum("bprc,vpr->bvpc", radiance, rows)
+            by_point = radiance.permute(1, 2, 3, 0).flatten(2)  # points, rows, rgb * batch
+            seen = torch.bmm(rows.transpose(0, 1), by_point)  # points, views, rgb * batch
+            radiance = seen.unflatten(2, (3, -1)).permute(3, 1, 0, 2)
         if shared:
             return radiance
         tracked = torch.is_grad_enabled() and (radiance.requires_grad or reflectance.requires_grad)

@@ -49,7 +49,7 @@ class Reflection:
         order: Bands of incident harmonics.
         matrices: ``"materials channels rows incident"`` float64, of the glossy parts.
         materials: ``"points"``: which of them each point has.
-        lambertian: ``"points channels"``: albedo of the Lambertian part that is not kept apart as
+        lambertian: ``"points own_channels"``: albedo of the Lambertian part that is not kept apart as
             reflectance; one row where all points share it.
         unresolved: Relative change of the worst material when its quadrature was last doubled;
             above :data:`RESOLVED` its lobe is too sharp for it.
@@ -59,7 +59,7 @@ class Reflection:
     order: int
     matrices: Float[Tensor, "materials channels rows incident"]
     materials: Int[Tensor, "points"]
-    lambertian: Float[Tensor, "points_or_one channels"]
+    lambertian: Float[Tensor, "points_or_one own_channels"]
     unresolved: float = 0.0
 
     @property

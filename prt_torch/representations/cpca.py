@@ -25,6 +25,7 @@ from prt_torch.representations.cpca_encoding import Encoding, Method, encode
 from prt_torch.representations.cpca_layout import VectorLayout
 from prt_torch.representations.cpca_search import Shape, random_encoding, search
 from prt_torch.representations.grouped import ClusterBlocks
+from prt_torch.representations.products import matmul_few
 from prt_torch.transfer import Surface, TransferTensor
 
 
@@ -231,7 +232,7 @@ class CPCA(Representation):
         vectors, channels, _, coeffs = self.representatives.shape
         if channels == 1:
             columns = light.permute(1, 2, 0).reshape(coeffs, -1)
-            lit = self.representatives.view(-1, coeffs) @ columns
+            lit = matmul_few(self.representatives.view(-1, coeffs), columns)
         else:
             by_channel = self.representatives.transpose(0, 1).reshape(channels, -1, coeffs)
             lit = torch.bmm(by_channel, light.permute(2, 1, 0)).permute(1, 0, 2)

@@ -61,7 +61,7 @@ class VectorLayout(nn.Module):
 
     def by_cluster(
         self, vectors: Float[Tensor, "vectors *rest"]
-    ) -> Float[Tensor, "clusters vectors *rest"]:
+    ) -> Float[Tensor, "clusters most *rest"]:
         """The mean, if affine, and the vectors of each cluster; zeros where it has no more."""
         if self.uniform:
             return vectors.unflatten(0, (self.num_clusters, self.max_rank + self.affine))
