@@ -49,8 +49,8 @@ class Reflection:
         order: Bands of incident harmonics.
         matrices: ``"materials channels rows incident"`` float64, of the glossy parts.
         materials: ``"points"``: which of them each point has.
-        lambertian: ``"points own_channels"``: albedo of the Lambertian part that is not kept apart as
-            reflectance; one row where all points share it.
+        lambertian: ``"points own_channels"``: albedo of the Lambertian part that is not kept apart
+            as reflectance; one row where all points share it.
         unresolved: Relative change of the worst material when its quadrature was last doubled;
             above :data:`RESOLVED` its lobe is too sharp for it.
     """
