@@ -165,7 +165,7 @@ def test_light_prior_is_expected_squared_radiance_error():
             total += float((error @ turned).square().sum())
             power += float(turned.square().sum())
     expected = total * 9 / power + 0.01 * float(error.square().sum())
-    assert float(metric.weigh(error).square().sum()) == pytest.approx(expected, rel=1e-10)
+    assert float(metric.weigh(error[None]).square().sum()) == pytest.approx(expected, rel=1e-10)
     assert torch.allclose(metric.unweigh(metric.weigh(error[None])), error[None])
 
 

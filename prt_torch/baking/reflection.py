@@ -74,7 +74,7 @@ class Reflection:
 
     def reflect(
         self, rows: slice, incident: Float[Tensor, "points channels incident coeffs"]
-    ) -> Float[Tensor, "points channels rows coeffs"]:
+    ) -> Float[Tensor, "points out_channels rows coeffs"]:
         """Exit radiance of some points.
 
         Args:
