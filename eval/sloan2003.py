@@ -34,8 +34,7 @@ from prt_torch.command import main
 from prt_torch.errors import InputError
 from prt_torch.relight import Relighter
 from prt_torch.representations import CPCA, DenseTransfer
-from prt_torch.representations.coherence import overdraw, reclassify, registers, superclusters
-from prt_torch.representations.cpca_relabel import ClusterErrors, with_labels
+from prt_torch.representations.cpca_relabel import coherence, reclassified
 from prt_torch.transfer import TransferTensor
 
 CLUSTERS = 256
@@ -147,21 +146,15 @@ def figure_5(transfer: TransferTensor, mesh: Mesh) -> Table:
         start = time.perf_counter()
         moved = model
         if budget:
-            errors = ClusterErrors(model, transfer)
-            labels = reclassify(model.labels, mesh.faces, errors, budget=budget)
-            moved = with_labels(model, transfer, labels)
-        groups = superclusters(
-            moved.labels,
-            mesh.faces,
-            registers_of_cluster=registers(moved.ranks, transfer.num_rows),
-        )
+            moved = reclassified(model, transfer, mesh.faces, budget=budget)
+        drawn = coherence(moved, mesh.faces)
         taken = time.perf_counter() - start
         table.add_row(
             f"error budget {budget:.0%}" if budget else "as fitted",
-            f"{overdraw(moved.labels, mesh.faces).double().mean():.3f}",
+            f"{drawn['overdraw']:.3f}",
             alone,
-            str(len(groups.unique())),
-            f"{overdraw(groups[moved.labels], mesh.faces).double().mean():.3f}",
+            str(drawn["superclusters"]),
+            f"{drawn['overdraw_merged']:.3f}",
             together,
             f"{evaluate.transfer_error(moved, transfer):.3e}",
             f"{taken:.1f}",

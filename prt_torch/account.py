@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch import evaluate, gallery, store
-from prt_torch.assets import Mesh
 from prt_torch.baking import RESOLVED
 from prt_torch.config import PreviewConfig
 from prt_torch.inputs import Inputs
@@ -17,7 +16,7 @@ from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.report import write_html
 from prt_torch.representations import CPCA, DenseTransfer, Representation
-from prt_torch.representations.coherence import overdraw, registers, superclusters
+from prt_torch.representations.cpca_relabel import coherence
 from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
@@ -100,25 +99,11 @@ def write_report(
         if scaled:
             result["dense_scaled"] = True
         if isinstance(one.representation, CPCA):
-            result["coherence"] = _coherence(one.representation, inputs.mesh)
+            result["coherence"] = coherence(one.representation, inputs.mesh.faces)
         report["results"].append(result)
     store.write_json(out / "report.json", report)
     write_html(out / "report.html", report, pictures)
     return report
-
-
-def _coherence(model: CPCA, mesh: Mesh) -> dict[str, float]:
-    """How often a face is drawn (Sloan et al. 2003, section 5)."""
-    merged = superclusters(
-        model.labels,
-        mesh.faces,
-        registers_of_cluster=registers(model.ranks, model.num_rows),
-    )
-    return {
-        "overdraw": float(overdraw(model.labels, mesh.faces).double().mean()),
-        "superclusters": len(merged.unique()),
-        "overdraw_merged": float(overdraw(merged[model.labels], mesh.faces).double().mean()),
-    }
 
 
 def _eyes(camera: Camera) -> Float[Tensor, "views 3"]:
@@ -136,11 +121,12 @@ def _relight(
     reference = evaluate.dense_radiance(transfer, light[None], views)[0]
     seen = torch.ones(1, 1) if views is None else evaluate.seen_from(transfer.surface, views)
     seen = seen[..., None].to(reference)
+    expected = reference * seen
     shown, errors = {}, {}
     for name, relight in relighters.items():
         radiance = relight(light[None], views)[0]
         shown[name] = radiance[0]
-        errors[name] = evaluate.radiance_error(radiance * seen, reference * seen)
+        errors[name] = evaluate.radiance_error(radiance * seen, expected)
     return (reference[0], shown), errors
 
 

@@ -73,8 +73,9 @@ def dense_radiance(
         ValueError: If the tensor needs views and none are given.
     """
     pieces = []
-    for rows, _ in transfer.blocks(_BLOCK_BYTES):
-        relight = Relighter(DenseTransfer.from_transfer(transfer.block(rows)))
+    for rows in transfer.ranges(_BLOCK_BYTES):
+        block = transfer.block(rows)
+        relight = Relighter(DenseTransfer(block.dense(), block.surface))
         pieces.append(relight(light.to(transfer.values.dtype), views))
     return torch.cat(pieces, dim=2)
 

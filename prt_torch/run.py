@@ -27,8 +27,7 @@ from prt_torch.inputs import Inputs, load_inputs
 from prt_torch.metric import Metric
 from prt_torch.report import summary_table
 from prt_torch.representations import CPCA, load, save
-from prt_torch.representations.coherence import reclassify
-from prt_torch.representations.cpca_relabel import ClusterErrors, with_labels
+from prt_torch.representations.cpca_relabel import reclassified
 from prt_torch.transfer import TransferTensor
 
 CONFIG, RESULTS = "config.yaml", "results"
@@ -234,9 +233,8 @@ def _closed_form(
             **common,
         )
     if wanted.reclassify:
-        errors = ClusterErrors(model, transfer, metric)
-        labels = reclassify(model.labels, inputs.mesh.faces, errors, budget=wanted.reclassify)
-        model = with_labels(model, transfer, labels, metric)
+        faces, budget = inputs.mesh.faces, wanted.reclassify
+        model = reclassified(model, transfer, faces, budget=budget, metric=metric)
     return model
 
 

@@ -8,6 +8,7 @@ Several transfers of one scene, such as glossy reflection and subsurface scatter
 by :func:`add`, whatever their exit bases.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
@@ -175,14 +176,18 @@ class TransferTensor:
             ),
         )
 
-    def blocks(self, max_bytes: int = 2**28) -> Iterator[tuple[slice, Tensor]]:
-        """Blocks of points of at most ``max_bytes`` (one point at least), in order."""
+    def ranges(self, max_bytes: int = 2**28) -> Iterator[slice]:
+        """Ranges of points whose values take at most ``max_bytes`` (one point at least)."""
         point_bytes = (
             self.num_channels * self.num_rows * self.num_coeffs * self.values.dtype.itemsize
         )
         step = max(1, max_bytes // point_bytes)
         for start in range(0, self.num_points, step):
-            rows = slice(start, min(start + step, self.num_points))
+            yield slice(start, min(start + step, self.num_points))
+
+    def blocks(self, max_bytes: int = 2**28) -> Iterator[tuple[slice, Tensor]]:
+        """The :meth:`ranges` of points with their values, in order."""
+        for rows in self.ranges(max_bytes):
             yield rows, self.values[rows]
 
     def squared_norm(self) -> Float[Tensor, "points"]:
@@ -250,16 +255,15 @@ class _SumOfRows:
         self._constant = float(constant)
         colours = [term.num_channels for term in terms]
         if not factored:
-            colours += [1 if is_grey(term.surface.reflectance) else 3 for term in terms]
+            colours += [colour_channels(term.surface.reflectance).shape[1] for term in terms]
         first = terms[0]
         self.shape = (first.num_points, max(colours), basis.num_rows, first.num_coeffs)
-        self.dtype = torch.promote_types(*(term.values.dtype for term in terms[:2]))
+        self.dtype = functools.reduce(torch.promote_types, (term.values.dtype for term in terms))
 
     def __getitem__(self, rows: slice, /) -> Tensor:
-        total = torch.zeros(len(range(*rows.indices(self.shape[0]))), *self.shape[1:])
-        total = total.to(self.dtype)
-        for term in self._terms:
-            values = term.values[rows].to(self.dtype)
+        pieces = [term.values[rows].to(self.dtype) for term in self._terms]
+        total = pieces[0].new_zeros(len(pieces[0]), *self.shape[1:])
+        for term, values in zip(self._terms, pieces, strict=True):
             if not self._factored:
                 reflectance = term.surface.reflectance.to(values)
                 reflectance = reflectance if len(reflectance) == 1 else reflectance[rows]
@@ -271,6 +275,8 @@ class _SumOfRows:
         return total
 
 
-def is_grey(reflectance: Float[Tensor, "points channels"]) -> bool:
-    """Whether all channels are the same at every point."""
-    return bool((reflectance == reflectance[:, :1]).all())
+def colour_channels(
+    reflectance: Float[Tensor, "points rgb"],
+) -> Float[Tensor, "points channels"]:
+    """The one channel of a reflectance that is grey at every point, else all three."""
+    return reflectance[:, :1] if bool((reflectance == reflectance[:, :1]).all()) else reflectance

@@ -1,8 +1,9 @@
 """From a scene to its transfer tensor."""
 
-from prt_torch.baking.direct import check_memory, project_diffuse
+from prt_torch.baking.direct import project_diffuse
 from prt_torch.baking.glossy import project_glossy
 from prt_torch.baking.interreflection import Bounces, interreflect
+from prt_torch.baking.projection import check_memory
 from prt_torch.baking.reflection import (
     RESOLVED,
     Reflection,

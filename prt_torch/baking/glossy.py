@@ -13,15 +13,13 @@ Source:
     Sloan, Hall, Hart, Snyder 2003, section 3.1 and equation 1.
 """
 
-import time
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from prt_torch import store
 from prt_torch.assets.mesh import Mesh
-from prt_torch.baking.direct import check_memory
+from prt_torch.baking.projection import check_memory, pieces, project_points
 from prt_torch.baking.reflection import Reflection
 from prt_torch.baking.visibility import Progress, VisibilityField
 from prt_torch.bases import SphericalHarmonics, sh
@@ -62,44 +60,22 @@ def project_glossy(
         ValueError: If mesh and visibility do not belong together.
         InputError: If the memory budget is too small, or the cache cannot be written or is damaged.
     """
-    if visibility.bits.shape[0] != mesh.num_points:
-        raise ValueError(
-            f"expected visibility of {mesh.num_points} points, got {visibility.bits.shape[0]}"
-        )
     seen_basis = SphericalHarmonics(reflection.order + light_basis.order - 1)
     at_once = check_memory(seen_basis, visibility.resolution, memory_budget)
     solid_angles = cubemap_solid_angles(visibility.resolution).reshape(-1)
     products = sh.product_matrix(reflection.order, light_basis.order).flatten(0, 1).mT
     frames = frame_from_normal(mesh.normals)
 
-    def project(rows: slice) -> tuple[dict[str, Tensor], dict[str, int | float]]:
-        start = time.perf_counter()
-        pieces = []
-        for first in range(rows.start, rows.stop, at_once):
-            some = slice(first, min(first + at_once, rows.stop))
+    def project(rows: slice) -> dict[str, Tensor]:
+        projected = []
+        for some in pieces(rows, at_once):
             seen = visibility.unpack(some).float() * solid_angles
-            pieces.append(seen_basis.project_cube(seen, visibility.resolution))
-        incident = torch.cat(pieces).double() @ products
+            projected.append(seen_basis.project_cube(seen, visibility.resolution))
+        incident = torch.cat(projected).double() @ products
         incident = incident.unflatten(1, (reflection.order**2, light_basis.num_coeffs))
         local = sh.rotation_matrix(frames[rows], reflection.order) @ incident
-        values = reflection.reflect(rows, local[:, None]).float()
-        return {"values": values}, {"seconds": time.perf_counter() - start}
+        return {"values": reflection.reflect(rows, local[:, None]).float()}
 
-    inputs = {
-        "visibility": store.digest(mesh.vertices, mesh.faces, visibility.resolution),
-        "normals": store.digest(mesh.normals),
-        "light_basis": light_basis.describe(),
-        "reflection": reflection.digest(),
-        "algorithm": _ALGORITHM,
-    }
-    built = store.build_sharded(
-        project,
-        rows=mesh.num_points,
-        rows_per_shard=_POINTS_PER_SHARD,
-        inputs=inputs,
-        folder=None if cache is None else Path(cache) / f"transfer-{store.digest(inputs)[:16]}",
-        progress=progress,
-    )
     surface = Surface(
         exit_basis=reflection.exit_basis,
         light_basis=light_basis,
@@ -107,12 +83,13 @@ def project_glossy(
         frames=frames,
         positions=mesh.vertices,
     )
-    provenance = {
-        "inputs": inputs,
-        "rays": visibility.rays,
-        "visibility_seconds": visibility.seconds,
-        "projection_seconds": built.counts["seconds"],
-        "visibility_cached": visibility.cached,
-        "projection_cached": built.cached,
-    }
-    return TransferTensor(built.tensors["values"], surface, None, provenance)
+    return project_points(
+        mesh,
+        visibility,
+        project,
+        surface=surface,
+        inputs={"reflection": reflection.digest(), "algorithm": _ALGORITHM},
+        points_per_shard=_POINTS_PER_SHARD,
+        cache=cache,
+        progress=progress,
+    )

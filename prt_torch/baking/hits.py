@@ -21,6 +21,7 @@ from torch import Tensor
 
 from prt_torch.assets.mesh import Mesh
 from prt_torch.assets.mesh_geometry import face_geometry
+from prt_torch.baking.projection import pieces
 from prt_torch.baking.visibility import Tracer, VisibilityField
 from prt_torch.bases import sh
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles
@@ -107,15 +108,11 @@ class HitFinder:
     @functools.cached_property
     def _tracer(self) -> Tracer:
         """Built only when there is something to trace."""
-        tracer = Tracer(self._mesh, self._visibility.resolution)
-        # Embree builds its hierarchy on the first query, not safely from two threads.
-        tracer.closest(np.zeros(1, np.int64), np.zeros(1, np.int64))
-        return tracer
+        return Tracer(self._mesh, self._visibility.resolution)
 
     def blocks(self, rows: slice) -> Iterator[slice]:
         """A range of points cut into blocks that :meth:`find` takes."""
-        for first in range(rows.start, rows.stop, self._points_at_once):
-            yield slice(first, min(first + self._points_at_once, rows.stop))
+        return pieces(rows, self._points_at_once)
 
     def nothing_hidden(self) -> bool:
         """Whether every point sees the sky in all directions above its horizon."""

@@ -35,7 +35,7 @@ from prt_torch.baking.reflection import Reflection
 from prt_torch.baking.visibility import Progress, VisibilityField
 from prt_torch.bases import Diffuse, ExitBasis, HemisphericalHarmonics, sh
 from prt_torch.sphere import cubemap_directions, frame_from_normal
-from prt_torch.transfer import is_grey
+from prt_torch.transfer import colour_channels
 
 _ALGORITHM = 1  # raise it when the same inputs would give other values
 _POINTS_PER_SHARD = 4096
@@ -173,7 +173,7 @@ def _per_channel(
     reflectance: Float[Tensor, "points_or_one rgb"],
 ) -> tuple[Float32[Tensor, "points_or_one channels 1 1"], int]:
     """Reflectance of each channel, and whether these are one or three."""
-    channels = reflectance[:, :1] if is_grey(reflectance) else reflectance
+    channels = colour_channels(reflectance)
     return channels.detach().float()[:, :, None, None], channels.shape[1]
 
 

@@ -5,6 +5,7 @@ glossy points make it matrices; channels become three only where colour cannot f
 are skipped where nothing hides anything; media cost nothing where there are none.
 """
 
+import functools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -24,7 +25,7 @@ from prt_torch.baking.subsurface import scatter
 from prt_torch.baking.visibility import Progress, VisibilityField, trace_visibility
 from prt_torch.bases import HemisphericalHarmonics, LightBasis, SphericalHarmonics
 from prt_torch.errors import InputError
-from prt_torch.transfer import TransferTensor, add, is_grey
+from prt_torch.transfer import TransferTensor, add, colour_channels
 
 Stages = Callable[[str], Progress]
 """Given the name of a stage, whom to tell of its progress."""
@@ -100,7 +101,8 @@ def bake(
         if material.medium is not None:
             start = time.perf_counter()
             terms.append(scene.subsurface(material, index == number))
-            facts["subsurface_seconds"] = time.perf_counter() - start
+            taken = time.perf_counter() - start
+            facts["subsurface_seconds"] = facts.get("subsurface_seconds", 0.0) + taken
     return replace(add(terms), provenance=facts)
 
 
@@ -120,7 +122,8 @@ class _Scene:
     def direct(self) -> TransferTensor:
         """Light that comes straight from the environment."""
         if not isinstance(self.reflection.exit_basis, HemisphericalHarmonics):
-            return self._diffuse(self.reflectance)
+            surface = replace(self.irradiance.surface, reflectance=self.reflectance)
+            return replace(self.irradiance, surface=surface)
         return project_glossy(
             self.mesh,
             self.visibility,
@@ -132,8 +135,10 @@ class _Scene:
             progress=self.tell("project transfer"),
         )
 
-    def _diffuse(self, reflectance: Tensor) -> TransferTensor:
-        irradiance = project_diffuse(
+    @functools.cached_property
+    def irradiance(self) -> TransferTensor:
+        """Direct light of points whose albedo is one."""
+        transfer = project_diffuse(
             self.mesh,
             self.visibility,
             self.basis,
@@ -141,19 +146,15 @@ class _Scene:
             memory_budget=self.memory_budget,
             progress=self.tell("project diffuse transfer"),
         )
-        surface = replace(irradiance.surface, reflectance=reflectance)
-        return replace(irradiance, surface=surface)
+        return replace(transfer, surface=replace(transfer.surface, reflectance=torch.ones(1, 3)))
 
     def bounces(self, direct: TransferTensor, max_bounces: int, tolerance: float) -> Bounces:
         """Light that other points of the scene have reflected before."""
-        reflectance = self.reflectance
-        if is_grey(reflectance):
-            reflectance = reflectance[:, :1]
         return interreflect(
             self.mesh,
             self.visibility,
             self.reflection,
-            direct.dense() * reflectance[:, :, None, None],
+            direct.dense() * colour_channels(self.reflectance)[:, :, None, None],
             self.reflectance,
             max_bounces=max_bounces,
             tolerance=tolerance,
@@ -164,15 +165,14 @@ class _Scene:
 
     def subsurface(self, material: Material, points: Bool[Tensor, "points"]) -> TransferTensor:
         """Light that has been inside a translucent object."""
-        irradiance = self._diffuse(torch.ones(1, 3))
         values = scatter(
             self.mesh,
-            irradiance.dense()[:, :, 0],
+            self.irradiance.dense()[:, :, 0],
             material.medium,  # pyright: ignore[reportArgumentType]
             millimetres_per_unit=material.millimetres_per_unit,
             points=points,
         )
-        return TransferTensor(values, irradiance.surface)
+        return TransferTensor(values, self.irradiance.surface)
 
 
 def _reflection(
@@ -190,9 +190,7 @@ def _reflection(
     factor = torch.where((diffuse & ~glossy)[:, None], albedo, (~none).to(albedo))
     if not bool(glossy.any()):
         return diffuse_reflection(mesh.num_points), shared_reflectance(factor)
-    lambertian = torch.where(both, albedo, diffuse[:, None].to(albedo))
-    if is_grey(lambertian):
-        lambertian = lambertian[:, :1]
+    lambertian = colour_channels(torch.where(both, albedo, diffuse[:, None].to(albedo)))
     reflection = glossy_reflection(
         [material.glossy for material in materials],
         index,

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from prt_torch.metric import Metric
+from prt_torch.representations.coherence import overdraw, reclassify, registers, superclusters
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.cpca_encoding import Encoding
 from prt_torch.representations.cpca_subspaces import one_thread
@@ -103,6 +104,43 @@ def with_labels(
         condition=model.condition,
     )
     return CPCA(encoding, model.surface, model.shape)
+
+
+def reclassified(
+    model: CPCA,
+    transfer: TransferTensor,
+    faces: Int[Tensor, "faces 3"],
+    *,
+    budget: float,
+    metric: Metric | None = None,
+) -> CPCA:
+    """Points moved to clusters of their neighbours, so that faces are drawn less often.
+
+    Args:
+        model: What was fitted; left as it is.
+        transfer: What it stands for.
+        faces: Points of each face.
+        budget: Share of the error that may be paid for it.
+        metric: What errors are worth; the L2 norm over light directions if not given.
+    """
+    errors = ClusterErrors(model, transfer, metric)
+    labels = reclassify(model.labels, faces, errors, budget=budget)
+    return with_labels(model, transfer, labels, metric)
+
+
+def coherence(model: CPCA, faces: Int[Tensor, "faces 3"]) -> dict[str, float]:
+    """How often a face is drawn, by clusters and by superclusters of 256 registers.
+
+    Source:
+        Sloan, Hall, Hart, Snyder 2003, sections 5 and 6.2.
+    """
+    needed = registers(model.ranks, model.num_rows)
+    merged = superclusters(model.labels, faces, registers_of_cluster=needed)
+    return {
+        "overdraw": float(overdraw(model.labels, faces).double().mean()),
+        "superclusters": len(merged.unique()),
+        "overdraw_merged": float(overdraw(merged[model.labels], faces).double().mean()),
+    }
 
 
 def _check_range(name: str, numbers: Tensor, count: int) -> None:

@@ -81,11 +81,6 @@ class AshikhminShirley(AnalyticBRDF):
         return count_channels(self.specular, self.diffuse)
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """Whether both exponents are equal."""
         return self.exponent_u == self.exponent_v

@@ -87,6 +87,11 @@ def _raise(
 class AnalyticBRDF(BRDF):
     """A reflectance model that is a formula: its description is its parameters."""
 
+    @property
+    def reciprocal(self) -> bool:
+        """True: every formula here is symmetric in its directions."""
+        return True
+
     def describe(self) -> dict[str, Any]:
         """``{"name": ...}`` and every parameter, colours as lists."""
         return {"name": self.name} | {

@@ -83,11 +83,6 @@ class CookTorrance(AnalyticBRDF):
         return count_channels(self.f0)
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """True."""
         return True

@@ -80,11 +80,6 @@ class GGX(AnalyticBRDF):
         return count_channels(self.f0)
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """Whether both roughnesses are equal."""
         return self.roughness_x == self.roughness_y

@@ -88,11 +88,6 @@ class Lafortune(AnalyticBRDF):
         return 1
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """Whether cx equals cy in every lobe."""
         return all(lobe.cx == lobe.cy for lobe in self.lobes)

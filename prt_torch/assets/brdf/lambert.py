@@ -45,11 +45,6 @@ class Lambert(AnalyticBRDF):
         return count_channels(self.albedo)
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """True."""
         return True

@@ -71,11 +71,6 @@ class Phong(AnalyticBRDF):
         return count_channels(self.specular)
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """True."""
         return True
@@ -122,11 +117,6 @@ class BlinnPhong(AnalyticBRDF):
     def num_channels(self) -> int:
         """3 if the specular colour is not grey."""
         return count_channels(self.specular)
-
-    @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
 
     @property
     def isotropic(self) -> bool:

@@ -87,11 +87,6 @@ class Schlick(AnalyticBRDF):
         return count_channels(self.f0)
 
     @property
-    def reciprocal(self) -> bool:
-        """True."""
-        return True
-
-    @property
     def isotropic(self) -> bool:
         """Whether p is 1."""
         return self.isotropy == 1.0

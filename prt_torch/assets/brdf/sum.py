@@ -48,7 +48,7 @@ class Sum(AnalyticBRDF):
 
     @property
     def reciprocal(self) -> bool:
-        """Whether every part is."""
+        """Whether every part is: measured ones are only nearly so."""
         return all(part.reciprocal for part in self.parts)
 
     @property
