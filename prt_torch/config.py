@@ -80,8 +80,14 @@ class MaterialConfig(PartConfig):
 class TransferConfig(_Section):
     """What is baked."""
 
-    light_basis: Literal["sh", "cube"] = "sh"
+    light_basis: Literal["sh", "cube", "haar"] = "sh"
     order: int = Field(6, ge=1, le=64, description="bands of spherical harmonics")
+    light_resolution: int | None = Field(
+        None, ge=1, le=512, description="texels along a light cube's edge; null is resolution"
+    )
+    light_segments: int = Field(
+        2, ge=1, le=512, description="Haar segments along a light cube's edge; 1 is whole faces"
+    )
     resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
     supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
     rows: int = Field(24, ge=2, le=64, description="exit functions of glossy scenes")
@@ -95,6 +101,31 @@ class TransferConfig(_Section):
                 "odd",
                 "resolution times supersampling must be even, got {resolution} times {factor}",
                 {"resolution": self.resolution, "factor": self.supersampling},
+            )
+        return self
+
+    @property
+    def light_texels(self) -> int:
+        """Texels along an edge of the cube that light is given on."""
+        return self.light_resolution or self.resolution
+
+    @model_validator(mode="after")
+    def _light_texels_are_whole(self) -> "TransferConfig":
+        if self.light_basis == "sh":
+            return self
+        texels, fine = self.light_texels, self.resolution * self.supersampling
+        if fine % texels:
+            raise PydanticCustomError(
+                "light_resolution",
+                "light_resolution must divide all {fine} rays along an edge, got {texels}",
+                {"texels": texels, "fine": fine},
+            )
+        segment, rest = divmod(texels, self.light_segments)
+        if self.light_basis == "haar" and (rest or segment.bit_count() != 1):
+            raise PydanticCustomError(
+                "light_segments",
+                "light_resolution {texels} over light_segments {segments} must be a power of two",
+                {"texels": texels, "segments": self.light_segments},
             )
         return self
 

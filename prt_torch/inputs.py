@@ -16,7 +16,7 @@ from prt_torch.assets.brdf import brdf
 from prt_torch.assets.material import Material
 from prt_torch.assets.medium import PRESETS
 from prt_torch.baking import check_memory
-from prt_torch.bases import CubeDirections, LightBasis, SphericalHarmonics
+from prt_torch.bases import CubeDirections, Haar, LightBasis, SphericalHarmonics
 from prt_torch.config import LightConfig, PartConfig, RunConfig, SceneConfig
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
@@ -128,8 +128,11 @@ def _material(key: str, wanted: PartConfig) -> Material:
 
 
 def _light_basis(config: RunConfig) -> LightBasis:
-    match config.transfer.light_basis:
+    transfer = config.transfer
+    match transfer.light_basis:
         case "sh":
-            return SphericalHarmonics(config.transfer.order)
+            return SphericalHarmonics(transfer.order)
         case "cube":
-            return CubeDirections(config.transfer.resolution)
+            return CubeDirections(transfer.light_texels)
+        case "haar":
+            return Haar(transfer.light_texels, transfer.light_texels // transfer.light_segments)

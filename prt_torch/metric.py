@@ -23,17 +23,19 @@ _MAX_PRIOR_COEFFS = 2048  # its matrix has the square of it
 
 @dataclass(frozen=True)
 class Metric:
-    """Squared error as the squared norm of ``row_factor.T @ difference @ factor``.
+    """Squared error as the squared norm of a difference that was weighed on its two sides.
 
     Attributes:
         name: ``l2`` or ``light_prior``.
-        factor: ``"coeffs"`` for a diagonal, or ``"coeffs coeffs"``; invertible, float64.
+        light: What weighs the light side: a basis whose functions have their L2 norm over the
+            sphere; a factor ``"coeffs coeffs"``, lower triangular, float64, that multiplies from
+            the right; or None where coefficients count as they are.
         row_factor: ``"rows rows"`` lower triangular, float64: Cholesky factor of the exit basis'
-            Gram matrix.
+            Gram matrix, whose transpose multiplies from the left.
     """
 
     name: str
-    factor: Float[Tensor, "coeffs"] | Float[Tensor, "coeffs coeffs"]
+    light: LightBasis | Float[Tensor, "coeffs coeffs"] | None = None
     row_factor: Float[Tensor, "rows rows"] = field(
         default_factory=lambda: torch.ones(1, 1, dtype=torch.float64)
     )
@@ -41,13 +43,8 @@ class Metric:
     @classmethod
     def l2(cls, transfer: TransferTensor) -> "Metric":
         """The L2 norm over the sphere of light directions, averaged over views."""
-        basis = transfer.surface.light_basis
-        row_factor = torch.linalg.cholesky(transfer.surface.exit_basis.gram())
-        if basis is None:
-            return cls("l2", torch.ones(transfer.num_coeffs, dtype=torch.float64), row_factor)
-        gram = basis.gram()
-        factor = gram.sqrt() if gram.ndim == 1 else torch.linalg.cholesky(gram)
-        return cls("l2", factor, row_factor)
+        row_factor = transfer.surface.exit_basis.gram_root()
+        return cls("l2", transfer.surface.light_basis, row_factor)
 
     @classmethod
     def light_prior(
@@ -87,22 +84,31 @@ class Metric:
             moment += unit @ unit.mT
         moment = moment * (coeffs / moment.trace().clamp_min(torch.finfo(torch.float64).tiny))
         moment = moment + floor * torch.eye(coeffs, dtype=torch.float64)
-        rows = (exit_basis or Diffuse()).gram()
-        return cls("light_prior", torch.linalg.cholesky(moment), torch.linalg.cholesky(rows))
+        rows = (exit_basis or Diffuse()).gram_root()
+        return cls("light_prior", torch.linalg.cholesky(moment), rows)
 
     def weigh(self, values: Float[Tensor, "... rows coeffs"]) -> Float[Tensor, "... rows coeffs"]:
-        """Into the space where errors are sums of squares."""
-        factor = self.factor.to(values)
+        """Into the space where errors are sums of squares; may be ``values`` itself."""
         if len(self.row_factor) > 1:
             values = self.row_factor.mT.to(values) @ values
-        return values * factor if factor.ndim == 1 else values @ factor
+        match self.light:
+            case None:
+                return values
+            case LightBasis():
+                return self.light.weigh(values)
+            case factor:
+                return values @ factor.to(values)
 
     def unweigh(self, values: Float[Tensor, "... rows coeffs"]) -> Float[Tensor, "... rows coeffs"]:
         """Back from it."""
-        factor = self.factor.to(values)
         if len(self.row_factor) > 1:
             upper = self.row_factor.mT.to(values)
             values = torch.linalg.solve_triangular(upper, values, upper=True)
-        if factor.ndim == 1:
-            return values / factor
-        return torch.linalg.solve_triangular(factor, values, upper=False, left=False)
+        match self.light:
+            case None:
+                return values
+            case LightBasis():
+                return self.light.unweigh(values)
+            case factor:
+                factor = factor.to(values)
+                return torch.linalg.solve_triangular(factor, values, upper=False, left=False)

@@ -83,9 +83,7 @@ class Relighter(nn.Module):
         if rows is None:
             radiance = radiance[:, None, :, 0]
         else:
-            by_point = radiance.permute(1, 2, 3, 0).flatten(2)  # points, rows, rgb * batch
-            seen = torch.bmm(rows.transpose(0, 1), by_point)  # points, views, rgb * batch
-            radiance = seen.unflatten(2, (3, -1)).permute(3, 1, 0, 2)
+            radiance = _towards(radiance, rows)
         if shared:
             return radiance
         tracked = torch.is_grad_enabled() and (radiance.requires_grad or reflectance.requires_grad)
@@ -93,7 +91,7 @@ class Relighter(nn.Module):
 
     def _view_rows(
         self, views: Tensor | None, frames: Tensor | None
-    ) -> Float[Tensor, "views points rows"] | None:
+    ) -> Float[Tensor, "views points rows"] | Float[Tensor, "views points rows rgb"] | None:
         """The exit basis at each view; None where radiance does not depend on it."""
         surface = self.representation.surface
         if not surface.exit_basis.view_dependent:
@@ -110,3 +108,17 @@ class Relighter(nn.Module):
             views = torch.nn.functional.normalize(views, dim=-1)
         local = torch.einsum("pij,vpj->vpi", frames.to(views), views)
         return surface.exit_basis.evaluate(local)
+
+
+def _towards(
+    radiance: Float[Tensor, "batch points rows rgb"],
+    rows: Float[Tensor, "views points rows"] | Float[Tensor, "views points rows rgb"],
+) -> Float[Tensor, "batch views points rgb"]:
+    """Rows of radiance times what each view sees of them."""
+    if rows.ndim == 3:
+        by_point = radiance.permute(1, 2, 3, 0).flatten(2)  # points, rows, rgb * batch
+        seen = torch.bmm(rows.transpose(0, 1), by_point)  # points, views, rgb * batch
+        return seen.unflatten(2, (3, -1)).permute(3, 1, 0, 2)
+    by_point = radiance.permute(1, 3, 2, 0).flatten(0, 1)  # points * rgb, rows, batch
+    seen = torch.bmm(rows.permute(1, 3, 0, 2).flatten(0, 1), by_point)
+    return seen.unflatten(0, (-1, 3)).permute(3, 2, 0, 1)

@@ -99,6 +99,20 @@ def frame_from_normal(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
     return torch.stack([tangent, bitangent, normal], dim=-2)
 
 
+def to_horizon(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Unit directions below the horizon z = 0 are taken to it; the others stay as they are.
+
+    Straight down goes to +x. Gradients are finite everywhere.
+    """
+    x, y, z = directions.unbind(-1)
+    below = z < 0
+    squared = x * x + y * y
+    straight_down = below & (squared == 0)
+    length = torch.where(below & ~straight_down, squared, 1.0).sqrt()
+    level = [torch.where(straight_down, 1.0, x / length), y / length, torch.zeros_like(z)]
+    return torch.where(below[..., None], torch.stack(level, -1), directions)
+
+
 def rotation_about_up(degrees: float) -> Float[Tensor, "3 3"]:
     """Rotation about +y, counter-clockwise seen from above: +x turns towards -z. Float64."""
     angle = math.radians(degrees)

@@ -204,7 +204,7 @@ class TransferTensor:
         """Squared norm in this tensor's light basis of other values, such as a difference."""
         basis, values = self.surface.light_basis, values.to(torch.float64)
         if self.num_rows > 1:
-            values = torch.linalg.cholesky(self.surface.exit_basis.gram()).mT.to(values) @ values
+            values = self.surface.exit_basis.gram_root().mT.to(values) @ values
         if basis is None:
             return values.square().sum((1, 2, 3))
         return basis.squared_norm(values).sum((1, 2))
@@ -221,7 +221,8 @@ def add(terms: Sequence[TransferTensor]) -> TransferTensor:
         terms: At least one. Their exit bases are diffuse, or one and the same.
 
     Raises:
-        ValueError: If points, light bases or exit bases do not fit together.
+        ValueError: If points, light bases or exit bases do not fit together, diffuse terms meet an
+            exit basis that does not hold the constant, or reflectances differ under coloured ones.
 
     Source:
         Sloan et al. 2003, section 3.1 and figure 9 (subsurface and glossy transfer in one matrix).
@@ -239,7 +240,11 @@ def add(terms: Sequence[TransferTensor]) -> TransferTensor:
             "expected terms of the same points and light basis, diffuse or of one exit basis, got "
             f"points and coeffs {sorted(sizes)}, light {sorted(lights)}, exit {sorted(kinds)}"
         )
+    if len(glossy) < len(terms) and not len(surface.exit_basis.constants()):
+        raise ValueError("expected an exit basis that holds the constant, for diffuse terms")
     shared = all(torch.equal(term.surface.reflectance, first.surface.reflectance) for term in terms)
+    if not shared and surface.exit_basis.num_channels > 1:
+        raise ValueError("expected terms of one reflectance, for coloured exit functions")
     values = _SumOfRows(terms, surface.exit_basis, factored=shared)
     reflectance = first.surface.reflectance if shared else torch.ones(1, 3)
     provenance = {"terms": [term.provenance for term in terms]}
@@ -251,11 +256,12 @@ class _SumOfRows:
 
     def __init__(self, terms: Sequence[TransferTensor], basis: ExitBasis, *, factored: bool):
         self._terms, self._factored = list(terms), factored
-        constant = basis.evaluate(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))[0]
-        self._constant = float(constant)
+        self._constants = basis.constants()
         colours = [term.num_channels for term in terms]
         if not factored:
             colours += [colour_channels(term.surface.reflectance).shape[1] for term in terms]
+        if len(self._constants) == 3:  # its rows are coloured already
+            colours = [1]
         first = terms[0]
         self.shape = (first.num_points, max(colours), basis.num_rows, first.num_coeffs)
         self.dtype = functools.reduce(torch.promote_types, (term.values.dtype for term in terms))
@@ -271,8 +277,18 @@ class _SumOfRows:
             if term.num_rows == self.shape[2]:
                 total += values
             else:
-                total[:, :, 0] += values[:, :, 0] / self._constant
+                total += self._embed(values[:, :, 0])
         return total
+
+    def _embed(
+        self, diffuse: Float[Tensor, "points channels coeffs"]
+    ) -> Float[Tensor, "points out_channels rows coeffs"]:
+        """Diffuse radiance in the rows of the exit basis."""
+        constants = self._constants.to(diffuse)
+        if len(constants) == 1:
+            return diffuse[:, :, None] * constants[0][:, None]
+        diffuse = diffuse.expand(-1, len(constants), -1)
+        return torch.einsum("pci,cr->pri", diffuse, constants)[:, None]
 
 
 def colour_channels(

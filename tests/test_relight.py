@@ -17,8 +17,14 @@ from prt_torch.transfer import TransferTensor
 class Linear(ExitBasis):
     """1, x, y, z of the local view direction: the smallest basis that depends on the view."""
 
-    num_rows = 4
+    num_rows, num_channels = 4, 1
     view_dependent = True
+
+    def constants(self):
+        return torch.eye(1, 4, dtype=torch.float64)
+
+    def tensors(self):
+        return {}
 
     def evaluate(self, view):
         return torch.cat([torch.ones_like(view[..., :1]), view], dim=-1)

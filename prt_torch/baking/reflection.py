@@ -86,8 +86,8 @@ class Reflection:
         shared = len(self.lambertian) == 1
         albedo = (self.lambertian if shared else self.lambertian[rows]).to(incident)
         if bool((albedo != 0).any()):
-            constant = self.exit_basis.evaluate(incident.new_tensor([0.0, 0.0, 1.0]))[0]
-            irradiance = incident[:, :, 2] * (_COSINE / math.pi / constant)
+            constant = float(self.exit_basis.constants()[0, 0])
+            irradiance = incident[:, :, 2] * (_COSINE / math.pi * constant)
             lambertian = albedo[:, :, None] * irradiance
             channels = max(exit_radiance.shape[1], lambertian.shape[1])
             exit_radiance = exit_radiance.expand(-1, channels, -1, -1).clone()
@@ -154,7 +154,7 @@ def project_brdf(
     nodes, change = _FIRST_NODES, math.inf
     matrix = _matrix(brdf, exit_basis, order, nodes)
     # Coefficients of nearly dependent functions mean little; what counts is the function.
-    views = torch.linalg.cholesky(exit_basis.gram()).mT
+    views = exit_basis.gram_root().mT
     lights = torch.linalg.cholesky(sh.hemisphere_gram(order))
     while change > RESOLVED and nodes < most:
         nodes *= 2

@@ -1,8 +1,10 @@
 """From a scene to its transfer tensor: rays, direct light, bounces, light through translucency.
 
 Only what the scene has is computed. A Lambertian scene has one row and its albedo stays a factor;
-glossy points make it matrices; channels become three only where colour cannot factor out; bounces
-are skipped where nothing hides anything; media cost nothing where there are none.
+glossy points make it matrices, towards hemispherical harmonics where light is in spherical
+harmonics, towards BRDF factors where light is in all frequencies; channels become three only where
+colour cannot factor out; bounces are skipped where nothing hides anything; media cost nothing where
+there are none.
 """
 
 import functools
@@ -10,26 +12,35 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from prt_torch.assets.brdf import Lambert, Sum
 from prt_torch.assets.material import Material, assign_materials
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.direct import project_diffuse, shared_reflectance
+from prt_torch.baking.factored import FactoredReflection, project_factored
 from prt_torch.baking.glossy import project_glossy
 from prt_torch.baking.interreflection import Bounces, interreflect
 from prt_torch.baking.reflection import Reflection, diffuse_reflection, glossy_reflection
 from prt_torch.baking.subsurface import scatter
 from prt_torch.baking.visibility import Progress, VisibilityField, trace_visibility
-from prt_torch.bases import HemisphericalHarmonics, LightBasis, SphericalHarmonics
+from prt_torch.bases import (
+    BRDFFactors,
+    HemisphericalHarmonics,
+    LightBasis,
+    SphericalHarmonics,
+)
 from prt_torch.errors import InputError
 from prt_torch.transfer import TransferTensor, add, colour_channels
 
 Stages = Callable[[str], Progress]
 """Given the name of a stage, whom to tell of its progress."""
 
+_HARMONICS, _FACTORS = 24, 10  # rows of glossy scenes unless said
 _MORE_LIGHT_BANDS = 1  # of a material's light side than of its view side: costs little, gains much
 
 
@@ -38,7 +49,8 @@ def bake(
     *,
     materials: Material | Mapping[str, Material] | None = None,
     light_basis: LightBasis | None = None,
-    num_rows: int = 24,
+    num_rows: int | None = None,
+    factors: BRDFFactors | None = None,
     max_bounces: int = 0,
     tolerance: float = 1e-3,
     resolution: int = 32,
@@ -54,8 +66,12 @@ def bake(
         materials: One for all points, or some by name of a part of the mesh, the rest being
             Lambertian with the mesh's albedo; all are if not given.
         light_basis: What to expand the light in; spherical harmonics of order 6 if not given.
-            Glossy materials need spherical harmonics.
-        num_rows: Exit functions of a scene with glossy materials.
+        num_rows: Exit functions of a scene with glossy materials: 24 hemispherical harmonics if
+            light is in spherical harmonics, else 10 BRDF factors (12 where Lambertian colours
+            differ between glossy points), unless given.
+        factors: BRDF factors of the glossy materials, in the order of ``materials``, in place of
+            those that are made; only where light is not in spherical harmonics. Their first view
+            function must be the constant where any part has a Lambertian or a translucent side.
         max_bounces: Most bounces between points; 0 for direct light only.
         tolerance: A bounce that adds less than this share of the exit radiance is the last.
         resolution: Texels along an edge of a face of the visibility cube.
@@ -66,17 +82,20 @@ def bake(
         stages: Told of the progress of each stage.
 
     Returns:
-        Diffuse transfer of one row, or rows in hemispherical harmonics where any part is glossy.
+        Diffuse transfer of one row, or rows of an exit basis where any part is glossy.
 
     Raises:
-        InputError: If the cache cannot be written or is damaged, a part is unknown, or a glossy
-            material meets a light basis other than spherical harmonics.
+        InputError: If the cache cannot be written or is damaged, a part is unknown, or bounces are
+            asked for of glossy materials whose light is not in spherical harmonics.
     """
     basis = light_basis or SphericalHarmonics(6)
     found, index = assign_materials(mesh, materials)
     glossy = any(material.glossy for material in found)
-    if glossy and not isinstance(basis, SphericalHarmonics):
-        raise InputError(f"glossy materials need light in spherical harmonics, got {basis.name}")
+    factored = glossy and not isinstance(basis, SphericalHarmonics)
+    if factored and max_bounces:
+        raise InputError(
+            f"max_bounces: glossy materials bounce light in spherical harmonics, not {basis.name}"
+        )
     tell = stages or (lambda _: lambda done, total: None)
     folder = None if cache is None else Path(cache)
     visibility = trace_visibility(
@@ -86,10 +105,16 @@ def bake(
         cache=folder,
         progress=tell("trace visibility"),
     )
-    reflection, reflectance = _reflection(mesh, found, index, num_rows if glossy else 1)
+    reflection, reflectance = _diffuse(mesh, found, index)
+    if factored:
+        if any(material.medium for material in found):  # one reflectance for all terms
+            reflectance = torch.ones(1, 3)
+        reflection = _factored(mesh, found, index, reflectance, num_rows, factors)
+    elif glossy:
+        reflection = _glossy(mesh, found, index, num_rows or _HARMONICS)
     scene = _Scene(mesh, visibility, basis, reflection, reflectance, folder, memory_budget, tell)
     direct = scene.direct()
-    terms, facts = [direct], {**direct.provenance, "unresolved": reflection.unresolved}
+    terms, facts = [direct], {**direct.provenance, **_quality(reflection)}
     if max_bounces > 0:
         bounces = scene.bounces(direct, max_bounces, tolerance)
         facts["bounces"] = {f.name: getattr(bounces, f.name) for f in fields(bounces)}
@@ -113,7 +138,7 @@ class _Scene:
     mesh: Mesh
     visibility: VisibilityField
     basis: LightBasis
-    reflection: Reflection
+    reflection: Reflection | FactoredReflection
     reflectance: Float[Tensor, "points_or_one rgb"]
     cache: Path | None
     memory_budget: int
@@ -121,19 +146,30 @@ class _Scene:
 
     def direct(self) -> TransferTensor:
         """Light that comes straight from the environment."""
-        if not isinstance(self.reflection.exit_basis, HemisphericalHarmonics):
-            surface = replace(self.irradiance.surface, reflectance=self.reflectance)
-            return replace(self.irradiance, surface=surface)
-        return project_glossy(
-            self.mesh,
-            self.visibility,
-            self.reflection,
-            self.basis,  # pyright: ignore[reportArgumentType]
-            reflectance=self.reflectance,
-            cache=self.cache,
-            memory_budget=self.memory_budget,
-            progress=self.tell("project transfer"),
-        )
+        shared: dict[str, Any] = {
+            "reflectance": self.reflectance,
+            "cache": self.cache,
+            "progress": self.tell("project transfer"),
+        }
+        if isinstance(self.reflection, FactoredReflection):
+            return project_factored(
+                self.mesh,
+                self.visibility,
+                self.reflection,
+                self.basis,  # pyright: ignore[reportArgumentType]
+                **shared,
+            )
+        if isinstance(self.reflection.exit_basis, HemisphericalHarmonics):
+            return project_glossy(
+                self.mesh,
+                self.visibility,
+                self.reflection,
+                self.basis,  # pyright: ignore[reportArgumentType]
+                memory_budget=self.memory_budget,
+                **shared,
+            )
+        surface = replace(self.irradiance.surface, reflectance=self.reflectance)
+        return replace(self.irradiance, surface=surface)
 
     @functools.cached_property
     def irradiance(self) -> TransferTensor:
@@ -153,7 +189,7 @@ class _Scene:
         return interreflect(
             self.mesh,
             self.visibility,
-            self.reflection,
+            self.reflection,  # pyright: ignore[reportArgumentType]
             direct.dense() * colour_channels(self.reflectance)[:, :, None, None],
             self.reflectance,
             max_bounces=max_bounces,
@@ -175,27 +211,86 @@ class _Scene:
         return TransferTensor(values, self.irradiance.surface)
 
 
-def _reflection(
-    mesh: Mesh, materials: list[Material], index: Tensor, num_rows: int
-) -> tuple[Reflection, Tensor]:
-    """How points reflect, and the reflectance that stays a factor.
+def _quality(reflection: Reflection | FactoredReflection) -> dict[str, Any]:
+    """What a report says of how well materials are represented."""
+    if isinstance(reflection, FactoredReflection):
+        return {"unresolved": 0.0, "factor_error": reflection.factors.rms}
+    return {"unresolved": reflection.unresolved}
+
+
+def _diffuse(
+    mesh: Mesh, materials: list[Material], index: Tensor
+) -> tuple[Reflection, Float[Tensor, "points_or_one rgb"]]:
+    """Reflection of a scene without glossy points, and the reflectance that stays a factor.
 
     Albedo is a factor of its own where a point is Lambertian and nothing else. Where it is glossy
-    too, albedo enters the matrices, as one channel if it is grey there.
+    too, albedo enters the rows.
     """
+    diffuse, glossy = _sides(materials, index)
+    albedo = mesh.albedo.to(torch.float32)
+    none = ~(diffuse | glossy)[:, None]
+    factor = torch.where((diffuse & ~glossy)[:, None], albedo, (~none).to(albedo))
+    return diffuse_reflection(mesh.num_points), shared_reflectance(factor)
+
+
+def _sides(materials: list[Material], index: Tensor) -> tuple[Tensor, Tensor]:
+    """Which points have a Lambertian side, and which a glossy one."""
     diffuse = torch.tensor([material.lambertian for material in materials])[index]
     glossy = torch.tensor([material.glossy is not None for material in materials])[index]
+    return diffuse, glossy
+
+
+def _glossy(mesh: Mesh, materials: list[Material], index: Tensor, num_rows: int) -> Reflection:
+    """Reflection towards hemispherical harmonics."""
+    diffuse, glossy = _sides(materials, index)
     albedo = mesh.albedo.to(torch.float32)
-    both, none = (diffuse & glossy)[:, None], ~(diffuse | glossy)[:, None]
-    factor = torch.where((diffuse & ~glossy)[:, None], albedo, (~none).to(albedo))
-    if not bool(glossy.any()):
-        return diffuse_reflection(mesh.num_points), shared_reflectance(factor)
+    both = (diffuse & glossy)[:, None]
     lambertian = colour_channels(torch.where(both, albedo, diffuse[:, None].to(albedo)))
-    reflection = glossy_reflection(
+    return glossy_reflection(
         [material.glossy for material in materials],
         index,
         lambertian,
         num_rows=num_rows,
         order=HemisphericalHarmonics(num_rows).order + _MORE_LIGHT_BANDS,
     )
-    return reflection, shared_reflectance(factor)
+
+
+def _factored(
+    mesh: Mesh,
+    materials: list[Material],
+    index: Tensor,
+    reflectance: Float[Tensor, "points_or_one rgb"],
+    num_rows: int | None,
+    factors: BRDFFactors | None,
+) -> FactoredReflection:
+    """Reflection by BRDF factors.
+
+    Where the Lambertian side of a glossy material has one albedo, it is factored with the rest, so
+    its colour costs no channels.
+    """
+    diffuse, _ = _sides(materials, index)
+    brdfs, numbers = [], torch.full((len(materials),), -1)
+    for number, material in enumerate(materials):
+        if material.glossy is None:
+            continue
+        numbers[number] = len(brdfs)
+        albedo = mesh.albedo[index == number]
+        if material.lambertian and len(albedo) and bool((albedo == albedo[0]).all()):
+            brdfs.append(Sum((Lambert(tuple(albedo[0].tolist())), material.glossy)))
+            diffuse = diffuse & (index != number)
+        else:
+            brdfs.append(material.glossy)
+    albedo = mesh.albedo.to(torch.float32) * diffuse[:, None]
+    lambertian = colour_channels(albedo / torch.where(reflectance > 0, reflectance, 1.0))
+    if not bool(lambertian.any()) and not any(material.medium for material in materials):
+        lambertian = lambertian[:, :0]
+    constants: Any = lambertian.shape[1]
+    if factors is None:
+        num_rows = num_rows or _FACTORS + max(0, constants - 1)
+        factors = BRDFFactors.from_brdf(brdfs, num_terms=num_rows, constants=constants)
+    elif (factors.num_materials, factors.num_constants) != (len(brdfs), constants):
+        raise ValueError(
+            f"expected factors of {len(brdfs)} materials with {constants} constants, got "
+            f"{factors.num_materials} with {factors.num_constants}"
+        )
+    return FactoredReflection(factors, numbers[index], lambertian)

@@ -1,24 +1,37 @@
 """Light bases and exit bases, and the closed list of their names."""
 
+from collections.abc import Mapping
 from typing import Any
 
-from prt_torch.bases import sh
+from torch import Tensor
+
+from prt_torch.bases import haar, sh
 from prt_torch.bases.base import ExitBasis, LightBasis, Radiance
+from prt_torch.bases.brdf_error import FactorError, factor_error
+from prt_torch.bases.brdf_factors import BRDFFactors
 from prt_torch.bases.cube import CubeDirections
 from prt_torch.bases.exit import Diffuse, HemisphericalHarmonics, Rowwise
+from prt_torch.bases.haar import Haar
+from prt_torch.bases.hemisphere_map import HemisphereMap
 from prt_torch.bases.sh import SphericalHarmonics
 from prt_torch.errors import InputError
 
 __all__ = [
+    "BRDFFactors",
     "CubeDirections",
     "Diffuse",
     "ExitBasis",
+    "FactorError",
+    "Haar",
+    "HemisphereMap",
     "HemisphericalHarmonics",
     "LightBasis",
     "Radiance",
     "Rowwise",
     "SphericalHarmonics",
     "exit_basis",
+    "factor_error",
+    "haar",
     "light_basis",
     "sh",
 ]
@@ -31,12 +44,14 @@ def light_basis(description: dict[str, Any]) -> LightBasis:
             return SphericalHarmonics(order)
         case {"name": "cube", "resolution": int(resolution)}:
             return CubeDirections(resolution)
+        case {"name": "haar", "resolution": int(resolution), "segment": int(segment)}:
+            return Haar(resolution, segment)
         case _:
-            raise InputError(f"light basis: expected sh or cube, got {description}")
+            raise InputError(f"light basis: expected sh, cube or haar, got {description}")
 
 
-def exit_basis(description: dict[str, Any]) -> ExitBasis:
-    """The exit basis that :meth:`ExitBasis.describe` described."""
+def exit_basis(description: dict[str, Any], tensors: Mapping[str, Tensor]) -> ExitBasis:
+    """The exit basis that :meth:`ExitBasis.describe` and :meth:`ExitBasis.tensors` gave."""
     match description:
         case {"name": "diffuse"}:
             return Diffuse()
@@ -44,7 +59,18 @@ def exit_basis(description: dict[str, Any]) -> ExitBasis:
             return HemisphericalHarmonics(num_rows)
         case {"name": "rows", "num_rows": int(num_rows)}:
             return Rowwise(num_rows)
+        case {
+            "name": "brdf_factors",
+            "mapping": str(mapping),
+            "resolution": int(resolution),
+            "num_constants": int(num_constants),
+        }:
+            hemisphere = HemisphereMap(mapping, resolution)  # pyright: ignore[reportArgumentType]
+            view_values = tensors["view_values"]
+            no_lights = view_values.new_zeros(0, len(view_values), hemisphere.num_texels)
+            return BRDFFactors(view_values, no_lights, hemisphere, num_constants=num_constants)
         case _:
             raise InputError(
-                f"exit basis: expected diffuse, hemispherical or rows, got {description}"
+                "exit basis: expected diffuse, hemispherical, rows or brdf_factors, "
+                f"got {description}"
             )

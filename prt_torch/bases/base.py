@@ -2,7 +2,7 @@
 
 Radiance is ``exit(view) · transfer · light_basis.project(environment)``. A transfer function of
 the light direction is the sum of its *values* times the basis functions; light enters as its
-inner products with them. Where the basis is not orthonormal, norms go through :meth:`gram`.
+inner products with them. Where the basis is not orthonormal, norms go through :meth:`weigh`.
 """
 
 from abc import ABC, abstractmethod
@@ -12,6 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+_LEAST_SQUARE = 1e-10  # of the mean, that a dependent row counts
 
 
 @runtime_checkable
@@ -80,12 +82,36 @@ class LightBasis(ABC):
     def describe(self) -> dict[str, Any]:
         """What :func:`prt_torch.bases.light_basis` needs to make this basis again; plain JSON."""
 
+    @abstractmethod
+    def weigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+        """Expansion coefficients into the space where sums of squares are squared L2 norms.
+
+        Of the functions, over the sphere: ``weigh(v) · weigh(w)`` is their inner product. In the
+        dtype of ``values``, without a matrix of coefficients by coefficients. May return
+        ``values`` itself.
+        """
+
+    @abstractmethod
+    def unweigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+        """The inverse of :meth:`weigh`."""
+
+    @abstractmethod
+    def weigh_light(
+        self, light: Float[Tensor, "*batch coeffs rgb"]
+    ) -> Float[Tensor, "*batch coeffs rgb"]:
+        """Light coefficients into the space of :meth:`weigh`, as inner products with it.
+
+        So ``weigh_light(light) · weigh(values)`` is the radiance ``light · values``, and sums of
+        squares are squared L2 norms of the light, as far as the basis can express it. May return
+        ``light`` itself.
+        """
+
     def squared_norm(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "..."]:
-        """Squared L2 norm over the sphere of the functions with these expansion coefficients."""
-        values = values.to(torch.float64)
-        gram = self.gram().to(values.device)
-        weighted = values * gram if gram.ndim == 1 else values @ gram
-        return (weighted * values).sum(-1)
+        """Squared L2 norm over the sphere of the functions with these expansion coefficients.
+
+        In float64.
+        """
+        return self.weigh(values.to(torch.float64)).square().sum(-1)
 
 
 class ExitBasis(ABC):
@@ -98,21 +124,58 @@ class ExitBasis(ABC):
 
     @property
     @abstractmethod
+    def num_channels(self) -> int:
+        """3 if the functions are coloured, else 1."""
+
+    @property
+    @abstractmethod
     def view_dependent(self) -> bool:
         """Whether radiance depends on the view; if not, relighting skips views altogether."""
 
     @abstractmethod
-    def evaluate(self, view: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rows"]:
-        """Basis functions at unit view directions in the shading frame."""
+    def evaluate(
+        self, view: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch rows"] | Float[Tensor, "*batch rows rgb"]:
+        """Basis functions at unit view directions in the shading frame.
+
+        Coloured ones have a last axis of three.
+        """
 
     @abstractmethod
     def gram(self) -> Float[Tensor, "rows rows"]:
-        """Mean of the products of two functions over the upper hemisphere of views, float64.
+        """Mean of the products of two functions over views of the upper hemisphere, float64.
+
+        And over colours, where they are coloured.
 
         A mean and not an integral, so that the Gram matrix of the constant is 1 and squared norms
         are those of the radiance that a view sees on average.
         """
 
     @abstractmethod
+    def constants(self) -> Float[Tensor, "colours rows"]:
+        """Rows of light that leaves alike in every direction, float64.
+
+        One line for light of any colour, or three for red, green and blue where the functions are
+        coloured; none where the basis does not hold the constant.
+        """
+
+    def gram_root(self) -> Float[Tensor, "rows rows"]:
+        """Lower Cholesky factor of :meth:`gram`, float64.
+
+        Where rows are dependent, or one is zero, each gets a little more than its square, so that
+        the factor can be inverted.
+        """
+        gram = self.gram()
+        root, failed = torch.linalg.cholesky_ex(gram)
+        if int(failed) == 0:
+            return root
+        ridge = _LEAST_SQUARE * (gram.diagonal().mean() + torch.finfo(gram.dtype).tiny)
+        return torch.linalg.cholesky(gram + ridge * torch.eye(len(gram), dtype=gram.dtype))
+
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """What :func:`prt_torch.bases.exit_basis` needs to make this basis again; plain JSON."""
+
+    @abstractmethod
+    def tensors(self) -> dict[str, Tensor]:
+        """What evaluating it needs besides :meth:`describe`; counted and kept in files."""

@@ -5,6 +5,7 @@ coefficients are mean radiances, transfer values are integrals of transfer over 
 included), and the Gram matrix is :math:`\operatorname{diag}(1/\Omega_j)`.
 """
 
+import functools
 from typing import Any
 
 import torch
@@ -89,6 +90,24 @@ class CubeDirections(LightBasis):
     def gram(self) -> Float[Tensor, "coeffs"]:
         """Diagonal of one over solid angle."""
         return 1.0 / self.solid_angles
+
+    def weigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+        """Integrals over texels, each over the square root of its solid angle."""
+        return values / self._root_solid_angles.to(values)
+
+    def unweigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+        """The inverse of :meth:`weigh`."""
+        return values * self._root_solid_angles.to(values)
+
+    def weigh_light(
+        self, light: Float[Tensor, "*batch coeffs rgb"]
+    ) -> Float[Tensor, "*batch coeffs rgb"]:
+        """Mean radiances of texels, each times the square root of its solid angle."""
+        return light * self._root_solid_angles.to(light)[:, None]
+
+    @functools.cached_property
+    def _root_solid_angles(self) -> Float[Tensor, "coeffs"]:
+        return self.solid_angles.sqrt()
 
     def rotate(
         self, coefficients: Float[Tensor, "*batch coeffs rgb"], rotation: Float[Tensor, "3 3"]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from prt_torch.bases import sh
 from prt_torch.bases.base import ExitBasis
+from prt_torch.sphere import to_horizon
 
 _MAX_HEMISPHERICAL = 64  # order 8: condition 3.5e9, still within float64
 
@@ -23,6 +24,11 @@ class Diffuse(ExitBasis):
         return 1
 
     @property
+    def num_channels(self) -> int:
+        """One."""
+        return 1
+
+    @property
     def view_dependent(self) -> bool:
         """False."""
         return False
@@ -31,6 +37,10 @@ class Diffuse(ExitBasis):
         """Ones."""
         return view.new_ones(*view.shape[:-1], 1)
 
+    def constants(self) -> Float[Tensor, "colours rows"]:
+        """One."""
+        return torch.ones(1, 1, dtype=torch.float64)
+
     def gram(self) -> Float[Tensor, "rows rows"]:
         """One."""
         return torch.ones(1, 1, dtype=torch.float64)
@@ -38,6 +48,10 @@ class Diffuse(ExitBasis):
     def describe(self) -> dict[str, Any]:
         """``{"name": "diffuse"}``."""
         return {"name": "diffuse"}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """None."""
+        return {}
 
 
 class HemisphericalHarmonics(ExitBasis):
@@ -72,17 +86,24 @@ class HemisphericalHarmonics(ExitBasis):
         return len(self.indices)
 
     @property
+    def num_channels(self) -> int:
+        """One."""
+        return 1
+
+    @property
     def view_dependent(self) -> bool:
         """True, but for the constant alone."""
         return self.num_rows > 1
 
     def evaluate(self, view: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rows"]:
         """The harmonics at the views, each taken to the horizon if below it."""
-        below = view[..., 2:] < 0
-        flat = torch.where(below, view * view.new_tensor([1.0, 1.0, 0.0]), view)
-        length = flat.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(view.dtype).tiny)
-        inside = torch.where(below, flat / length, flat)
-        return sh.evaluate(inside, self.order)[..., self.indices.to(view.device)]
+        return sh.evaluate(to_horizon(view), self.order)[..., self.indices.to(view.device)]
+
+    def constants(self) -> Float[Tensor, "colours rows"]:
+        """The first function, which is the constant y_(0,0), over its value."""
+        rows = torch.zeros(1, self.num_rows, dtype=torch.float64)
+        rows[0, 0] = math.sqrt(4.0 * math.pi)
+        return rows
 
     def gram(self) -> Float[Tensor, "rows rows"]:
         """The hemispherical Gram matrix over 2π."""
@@ -92,6 +113,10 @@ class HemisphericalHarmonics(ExitBasis):
     def describe(self) -> dict[str, Any]:
         """``{"name": "hemispherical", "num_rows": n}``."""
         return {"name": "hemispherical", "num_rows": self.num_rows}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """None."""
+        return {}
 
 
 @functools.lru_cache(maxsize=8)
@@ -126,9 +151,18 @@ class Rowwise(ExitBasis):
         return self._num_rows
 
     @property
+    def num_channels(self) -> int:
+        """One."""
+        return 1
+
+    @property
     def view_dependent(self) -> bool:
         """True: rows are not radiance yet."""
         return True
+
+    def constants(self) -> Float[Tensor, "colours rows"]:
+        """None: the functions are not known."""
+        return torch.zeros(0, self._num_rows, dtype=torch.float64)
 
     def gram(self) -> Float[Tensor, "rows rows"]:
         """The identity: rows count alike."""
@@ -144,3 +178,7 @@ class Rowwise(ExitBasis):
     def describe(self) -> dict[str, Any]:
         """``{"name": "rows", "num_rows": n}``."""
         return {"name": "rows", "num_rows": self._num_rows}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """None."""
+        return {}

@@ -296,6 +296,20 @@ class SphericalHarmonics(LightBasis):
         """Ones: the basis is orthonormal."""
         return torch.ones(self.num_coeffs, dtype=torch.float64)
 
+    def weigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+        """Itself: the basis is orthonormal."""
+        return values
+
+    def unweigh(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "... coeffs"]:
+        """Itself."""
+        return values
+
+    def weigh_light(
+        self, light: Float[Tensor, "*batch coeffs rgb"]
+    ) -> Float[Tensor, "*batch coeffs rgb"]:
+        """Itself."""
+        return light
+
     def rotate(
         self, coefficients: Float[Tensor, "*batch coeffs rgb"], rotation: Float[Tensor, "3 3"]
     ) -> Float[Tensor, "*batch coeffs rgb"]:

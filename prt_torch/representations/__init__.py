@@ -4,5 +4,6 @@ from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.dense import DenseTransfer
 from prt_torch.representations.files import load, save
+from prt_torch.representations.wavelet import WaveletTransfer
 
-__all__ = ["CPCA", "DenseTransfer", "Representation", "load", "save"]
+__all__ = ["CPCA", "DenseTransfer", "Representation", "WaveletTransfer", "load", "save"]

@@ -101,9 +101,11 @@ class Representation(nn.Module, ABC):
         """Condition number of the worst solve of its construction; 1 where there was none."""
 
     def storage(self) -> dict[str, int]:
-        """Bytes of each part of a file of it, reflectance included."""
+        """Bytes of each part of a file of it, reflectance and exit basis included."""
         parts = {name: tensor.nbytes for name, tensor in self.packed().items()}
-        return {**parts, "reflectance": self.reflectance.nbytes}
+        exit_bytes = sum(tensor.nbytes for tensor in self._surface.exit_basis.tensors().values())
+        exits = {"exit_basis": exit_bytes} if exit_bytes else {}
+        return {**parts, "reflectance": self.reflectance.nbytes, **exits}
 
     @property
     def shape(self) -> tuple[int, int, int, int]:

@@ -13,10 +13,15 @@ from prt_torch.errors import InputError
 from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.dense import DenseTransfer
+from prt_torch.representations.wavelet import WaveletTransfer
 from prt_torch.transfer import Surface
 
-KINDS: dict[str, type[Representation]] = {kind.kind: kind for kind in (CPCA, DenseTransfer)}
+KINDS: dict[str, type[Representation]] = {
+    kind.kind: kind for kind in (CPCA, DenseTransfer, WaveletTransfer)
+}
 """The closed registry of representations: name in configurations and files, to class."""
+
+_EXIT = "exit."  # before the names of the tensors of the exit basis
 
 
 def save(representation: Representation, path: Path | str) -> None:
@@ -34,6 +39,7 @@ def save(representation: Representation, path: Path | str) -> None:
         "exit_basis": surface.exit_basis.describe(),
     }
     tensors = {**representation.packed(), "reflectance": surface.reflectance}
+    tensors |= {_EXIT + name: tensor for name, tensor in surface.exit_basis.tensors().items()}
     written = store.write_tensors(path, tensors, header)
     store.write_bytes(checksum_path(path), f"{written['sha256']}  {path.name}\n".encode())
 
@@ -55,8 +61,13 @@ def load(path: Path | str) -> Representation:
     kind = header.get("kind") if isinstance(header, dict) else None
     if kind not in KINDS:
         raise InputError(f"{path}: expected a representation of {sorted(KINDS)}, got {kind!r}")
+    of_exit = {
+        name.removeprefix(_EXIT): tensors.pop(name)
+        for name in list(tensors)
+        if name.startswith(_EXIT)
+    }
     surface = Surface(
-        exit_basis=exit_basis(header["exit_basis"]),
+        exit_basis=exit_basis(header["exit_basis"], of_exit),
         light_basis=light_basis(header["light_basis"]) if header["light_basis"] else None,
         reflectance=tensors.pop("reflectance"),
     )
