@@ -7,10 +7,14 @@ from typing import Any
 from prt_torch.assets.brdf.ashikhmin_shirley import AshikhminShirley
 from prt_torch.assets.brdf.base import BRDF, AnalyticBRDF
 from prt_torch.assets.brdf.cook_torrance import CookTorrance
+from prt_torch.assets.brdf.cornell import Cornell
 from prt_torch.assets.brdf.ggx import GGX
 from prt_torch.assets.brdf.lafortune import Lafortune
 from prt_torch.assets.brdf.lambert import Lambert
+from prt_torch.assets.brdf.measured import MeasuredBRDF
+from prt_torch.assets.brdf.merl import MERL
 from prt_torch.assets.brdf.phong import BlinnPhong, Phong
+from prt_torch.assets.brdf.rgl import RGL
 from prt_torch.assets.brdf.schlick import Schlick
 from prt_torch.assets.brdf.sum import Sum
 from prt_torch.errors import InputError
@@ -26,7 +30,10 @@ NAMES = (
     "ggx",
     "sum",
 )
-"""What a description's ``name`` may be."""
+"""What a description's ``name`` may be for a model that is a formula."""
+
+MEASURED_NAMES = ("rgl", "cornell", "merl")
+"""What it may be for a file of measurements; its other parameter is the ``path``."""
 
 
 def brdf(description: Mapping[str, Any]) -> BRDF:
@@ -36,7 +43,8 @@ def brdf(description: Mapping[str, Any]) -> BRDF:
         description: ``name`` and the model's parameters; colours may be lists.
 
     Raises:
-        InputError: If the name or a key is unknown, a key is missing, or a value out of range.
+        InputError: If the name or a key is unknown, a key is missing, a value out of range, or a
+            file missing, malformed or not the one described.
     """
     return _build("brdf", description)
 
@@ -61,11 +69,13 @@ def _build(key: str, description: object) -> BRDF:
             raise InputError(f"{key}.{parameter}: missing; {name} needs it")
     try:
         return model(**parameters)
+    except InputError:
+        raise  # about a file, which its line names
     except ValueError as error:
         raise InputError(f"{key}.{error}") from None
 
 
-def _model(key: str, name: object) -> type[AnalyticBRDF]:
+def _model(key: str, name: object) -> type[AnalyticBRDF | MeasuredBRDF]:
     match name:
         case "lambert":
             return Lambert
@@ -85,5 +95,12 @@ def _model(key: str, name: object) -> type[AnalyticBRDF]:
             return GGX
         case "sum":
             return Sum
+        case "rgl":
+            return RGL
+        case "cornell":
+            return Cornell
+        case "merl":
+            return MERL
         case _:
-            raise InputError(f"{key}.name: expected one of {', '.join(NAMES)}, got {name!r}")
+            known = ", ".join(NAMES + MEASURED_NAMES)
+            raise InputError(f"{key}.name: expected one of {known}, got {name!r}")
