@@ -10,13 +10,13 @@ from torch import Tensor
 
 from prt_torch import evaluate, gallery, store
 from prt_torch.baking import RESOLVED
-from prt_torch.config import PreviewConfig
 from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.report import write_html
 from prt_torch.representations import CPCA, DenseTransfer, Representation
 from prt_torch.representations.cpca_relabel import coherence
+from prt_torch.settings import PreviewConfig
 from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
@@ -173,6 +173,7 @@ def _facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
             and made["projection_cached"]
             and bounces.get("cached", True),
             **({"bounces": bounces["added"]} if bounces else {}),
+            **({"factor_error": made["factor_error"]} if "factor_error" in made else {}),
             **({"unresolved": made["unresolved"]} if made["unresolved"] > RESOLVED else {}),
         },
         "raw_bytes": transfer.num_bytes,

@@ -17,9 +17,9 @@ from prt_torch.assets.material import Material
 from prt_torch.assets.medium import PRESETS
 from prt_torch.baking import check_memory
 from prt_torch.bases import CubeDirections, Haar, LightBasis, SphericalHarmonics
-from prt_torch.config import LightConfig, PartConfig, RunConfig, SceneConfig
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
+from prt_torch.settings import LightConfig, PartConfig, RunConfig, SceneConfig
 
 
 @dataclass(frozen=True)

@@ -71,23 +71,52 @@ class Relighter(nn.Module):
         most = self._max_bytes if rows is None else min(self._max_bytes, _ROWS_BYTES)
         at_once = max(1, most // (radiance_bytes * light.dtype.itemsize))
         if len(light) <= at_once:
-            return self._relight(light, rows, frames)
-        return torch.cat([self._relight(some, rows, frames) for some in light.split(at_once)])
+            return self._shade(self.transferred(light, frames), rows, own=True)
+        turns = light.split(at_once)
+        lit = (self.transferred(some, frames) for some in turns)
+        return torch.cat([self._shade(some, rows, own=True) for some in lit])
 
-    def _relight(self, light: Tensor, rows: Tensor | None, frames: Tensor | None) -> Tensor:
+    def transferred(
+        self, light: Tensor, frames: Float[Tensor, "points 3 3"] | None = None
+    ) -> Float[Tensor, "batch points rows rgb"]:
+        """What light becomes before anyone looks at it; it stays as it is when only views change.
+
+        Args:
+            light: Light coefficients, as in :meth:`forward`.
+            frames: Shading frames of a deformed surface.
+        """
         reflectance = self.representation.reflectance
-        shared = len(reflectance) == 1
-        if shared:  # as well times the few coefficients of the light as times every point
+        if len(reflectance) == 1:  # as well times the few coefficients of the light as every point
             light = light * reflectance
-        radiance = self.representation(light, frames)
-        if rows is None:
-            radiance = radiance[:, None, :, 0]
-        else:
-            radiance = _towards(radiance, rows)
-        if shared:
+        return self.representation(light, frames)
+
+    def shade(
+        self,
+        transferred: Float[Tensor, "batch points rows rgb"],
+        views: Float[Tensor, "views *points 3"] | None = None,
+        frames: Float[Tensor, "points 3 3"] | None = None,
+    ) -> Float[Tensor, "batch views points rgb"]:
+        """Radiance towards views of what :meth:`transferred` gave: a change of view costs only this.
+
+        Args:
+            transferred: Of a batch of lights.
+            views: As in :meth:`forward`.
+            frames: Shading frames of a deformed surface.
+
+        Raises:
+            ValueError: If views are needed and not given.
+        """
+        rows = self._view_rows(views, frames)
+        return self._shade(transferred, rows, own=rows is not None)
+
+    def _shade(self, radiance: Tensor, rows: Tensor | None, *, own: bool) -> Tensor:
+        """Radiance towards views; ``own`` if it may be written to."""
+        reflectance = self.representation.reflectance
+        radiance = radiance[:, None, :, 0] if rows is None else _towards(radiance, rows)
+        if len(reflectance) == 1:
             return radiance
         tracked = torch.is_grad_enabled() and (radiance.requires_grad or reflectance.requires_grad)
-        return radiance * reflectance if tracked else radiance.mul_(reflectance)
+        return radiance.mul_(reflectance) if own and not tracked else radiance * reflectance
 
     def _view_rows(
         self, views: Tensor | None, frames: Tensor | None

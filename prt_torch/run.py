@@ -19,15 +19,28 @@ from prt_torch import store
 from prt_torch.account import PICTURES, Fitted, write_report
 from prt_torch.assets import Mesh
 from prt_torch.baking import RESOLVED, bake
-from prt_torch.config import RepresentationConfig, RunConfig
 from prt_torch.errors import InputError
 from prt_torch.fitting import fit
 from prt_torch.gallery import file_name
 from prt_torch.inputs import Inputs, load_inputs
 from prt_torch.metric import Metric
 from prt_torch.report import summary_table
-from prt_torch.representations import CPCA, load, save
+from prt_torch.representations import (
+    CPCA,
+    Representation,
+    SegmentedCPCA,
+    WaveletTransfer,
+    load,
+    save,
+)
 from prt_torch.representations.cpca_relabel import reclassified
+from prt_torch.settings import (
+    CPCAConfig,
+    RepresentationConfig,
+    RunConfig,
+    SegmentedCPCAConfig,
+    WaveletConfig,
+)
 from prt_torch.transfer import TransferTensor
 
 CONFIG, RESULTS = "config.yaml", "results"
@@ -109,7 +122,7 @@ def _identity(config: RunConfig) -> dict[str, Any]:
 
 
 def _load(config: RunConfig) -> Inputs:
-    results = [_name(wanted) for wanted in config.fitted]
+    results = [wanted.label for wanted in config.fitted]
     if len(set(results)) != len(results):
         raise InputError(f"representations: expected different ones, got {', '.join(results)}")
     return load_inputs(config)
@@ -184,7 +197,7 @@ def _fit_all(
     fitted = []
     with _progress(console) as progress:
         for wanted in config.fitted:
-            name = _name(wanted)
+            name = wanted.label
             task = progress.add_task(f"fit {name}", total=config.fit.max_steps or 1)
             fitted.append(
                 _fit_one(
@@ -202,28 +215,35 @@ def _fit_all(
     return fitted
 
 
-def _name(wanted: RepresentationConfig) -> str:
-    method = "" if wanted.method == "iterative" else f" {wanted.method}"
-    linear = "" if wanted.affine else " linear"
-    moved = f" reclassified {wanted.reclassify:g}" if wanted.reclassify else ""
-    size = f"{wanted.num_clusters}x{wanted.rank}"
-    for limit, value in wanted.limits.items():
-        size = f"{limit.removeprefix('max_')} {value:g}"
-    return f"{wanted.name}{method}{linear} {size}{moved}"
-
-
 def _closed_form(
     wanted: RepresentationConfig,
     config: RunConfig,
     inputs: Inputs,
     transfer: TransferTensor,
     metric: Metric,
-) -> CPCA:
+) -> Representation:
     """A representation as its paper constructs it."""
-    generator = torch.Generator().manual_seed(config.seed)
-    common: dict[str, Any] = {"method": wanted.method, "metric": metric, "generator": generator}
+    common: dict[str, Any] = {
+        "metric": metric,
+        "generator": torch.Generator().manual_seed(config.seed),
+    }
+    options = wanted.model_dump(exclude={"name"})
+    match wanted:
+        case CPCAConfig():
+            return _clustered(wanted, inputs, transfer, common)
+        case SegmentedCPCAConfig():
+            budget = config.memory_budget
+            return SegmentedCPCA.from_transfer(transfer, memory_budget=budget, **options, **common)
+        case WaveletConfig():
+            return WaveletTransfer.from_transfer(transfer, **options)
+
+
+def _clustered(
+    wanted: CPCAConfig, inputs: Inputs, transfer: TransferTensor, common: dict[str, Any]
+) -> CPCA:
+    common = {"method": wanted.method, **common}
     if wanted.limits:
-        model = CPCA.within(transfer, **wanted.limits, **common)  # pyright: ignore[reportArgumentType]
+        model = CPCA.within(transfer, **wanted.limits, **common)
     else:
         model = CPCA.from_transfer(
             transfer,
@@ -233,7 +253,7 @@ def _closed_form(
             **common,
         )
     if wanted.reclassify:
-        faces, budget = inputs.mesh.faces, wanted.reclassify
+        faces, budget, metric = inputs.mesh.faces, wanted.reclassify, common["metric"]
         model = reclassified(model, transfer, faces, budget=budget, metric=metric)
     return model
 

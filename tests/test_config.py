@@ -8,9 +8,10 @@ from omegaconf import OmegaConf
 from pydantic import BaseModel
 
 from prt_torch.baking import bake
-from prt_torch.config import RunConfig, load_config, parse_command_line
+from prt_torch.config import load_config, parse_command_line
 from prt_torch.errors import InputError
 from prt_torch.representations import CPCA
+from prt_torch.settings import RunConfig
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 COMPLETE = sorted(path.stem for path in CONFIGS.glob("*.yaml"))

@@ -7,16 +7,8 @@ Four closed forms, each the optimum of its own question:
 * :func:`symmetric_factors`: the same for a reciprocal model without cosine, by eigenvectors with
   signs (Wang et al. 2004, section 3.2);
 * :func:`harmonic_factors`: light side in spherical harmonics (Sloan et al. 2005, equation 14);
-* :func:`interpolated_factors`: best sum for the functions that *bilinear lookups* of the maps make,
-  over all pairs of directions. Lookups are linear in the texels, so with the mass matrices
-  :math:`M_{tu} = \int h_t h_u` of the hat functions of texels and the moments
-  :math:`C_{tu} = \iint h_t(v)\, f(v, s)\, h_u(s)` the error is
-
-  .. math:: \iint (f - \sum_k G_k F_k)^2 = \iint f^2 - 2 \operatorname{tr}(G^T C F)
-            + \operatorname{tr}(G^T M_v G\, F^T M_s F)
-
-  whose optimum is one singular value decomposition between Cholesky factors of M. No iteration can
-  find a better one; constraints need iterations (:mod:`prt_torch.bases.brdf_refinement`).
+* :func:`~prt_torch.bases.brdf_moments.interpolated_factors`: best sum for the functions that
+  bilinear lookups of the maps make, over all pairs of directions.
 
 Several materials share their view maps and colours share their light maps: columns of the matrix
 are pairs of material and light, rows pairs of view and colour. By Eckart and Young no factoring of
@@ -29,14 +21,13 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from prt_torch.bases import sh
 from prt_torch.bases.hemisphere_map import HemisphereMap
 
 _PAIRS_AT_ONCE = 2**17  # their temporaries stay in the processor's cache
-_RIDGE = 1e-4  # of a texel's own mass: texels at the rim that hardly any direction uses stay small
 _MORE_VECTORS = 16  # of the randomised decomposition than terms wanted
 
 
@@ -145,7 +136,9 @@ def singular_factors(
         by_light = values.new_zeros(*values.shape[:-1], texels).index_add(-1, texel_of, values)
         total.index_add_(0, texel_of[some], by_light)
     mean = total[used][..., used] / (count[used][:, None, None, None] * count[used])
-    left, singular, right = _leading(mean.permute(1, 0, 2, 3).flatten(2).flatten(0, 1), num_terms)
+    left, singular, right = leading_triplets(
+        mean.permute(1, 0, 2, 3).flatten(2).flatten(0, 1), num_terms
+    )
     root = singular.sqrt()
     view = (left * root).mT.unflatten(1, (colours, -1))
     light = (right * root).mT.unflatten(1, (materials, -1)).transpose(0, 1)
@@ -161,7 +154,7 @@ def symmetric_factors(target: Target, hemisphere: HemisphereMap, num_terms: int)
     r"""Eigenvectors of the matrix of texel centres: :math:`f \approx \sum_k \lambda_k q_k q_k`.
 
     Light map :math:`\sqrt{|\lambda|}\, q`, view map the same with the sign of λ. Colours are
-    factored each alone, one after the other in the rows. What little a measured model lacks in
+    factored each alone, and their rows go by magnitude. What little a measured model lacks in
     reciprocity is averaged away.
 
     Args:
@@ -192,9 +185,9 @@ def symmetric_factors(target: Target, hemisphere: HemisphereMap, num_terms: int)
         views.append(view)
         lights.append(maps)
         energies.append(eigenvalues.square())
-    return Factors(
-        torch.cat(views), torch.cat(lights)[None], torch.cat(energies), float(matrix.square().sum())
-    )
+    energy, order = torch.cat(energies).sort(descending=True, stable=True)
+    view, light = torch.cat(views)[order], torch.cat(lights)[order]
+    return Factors(view, light[None], energy, float(matrix.square().sum()))
 
 
 def leading_eigenpairs(
@@ -236,128 +229,12 @@ def harmonic_factors(
     projected = [values @ weighted for _, values in target.blocks(views[used], lights)]
     matrix = torch.cat(projected)  # views, colours, materials, harmonics
     colours, materials = matrix.shape[1:3]
-    left, singular, right = _leading(matrix.transpose(0, 1).flatten(2).flatten(0, 1), num_terms)
+    left, singular, right = leading_triplets(
+        matrix.transpose(0, 1).flatten(2).flatten(0, 1), num_terms
+    )
     view = fill(left.mT.unflatten(1, (colours, -1)), used, hemisphere)
     light = (right * singular).mT.unflatten(1, (materials, -1)).transpose(0, 1)
     return Factors(view, light, singular.square(), float(matrix.square().sum()))
-
-
-@dataclass(frozen=True)
-class Moments:
-    """All that the error of bilinear factors depends on; see the head of the module.
-
-    Attributes:
-        view_mass: ``"texels texels"`` integrals of products of two hats over views.
-        light_mass: The same over lights, weighted as errors are.
-        moments: ``"colours texels materials texels"`` of the function.
-        energy: Its weighted squared norm.
-    """
-
-    view_mass: Float[Tensor, "texels texels"]
-    light_mass: Float[Tensor, "texels texels"]
-    moments: Float[Tensor, "colours texels materials texels"]
-    energy: float
-
-    def error(
-        self,
-        view: Float[Tensor, "rows colours texels"],
-        light: Float[Tensor, "materials rows texels"],
-    ) -> Float[Tensor, ""]:
-        """Weighted squared error of factors; differentiable."""
-        view_gram = torch.einsum("kct,tu,lcu->kl", view, self.view_mass, view)
-        light_gram = torch.einsum("mkt,tu,mlu->kl", light, self.light_mass, light)
-        half = torch.einsum("ctmu,mku->kct", self.moments, light)
-        return self.energy - 2 * (view * half).sum() + (view_gram * light_gram).sum()
-
-
-def bilinear_moments(
-    target: Target, hemisphere: HemisphereMap, *, supersampling: int = 2
-) -> Moments:
-    """Integrate a model against the hats of all pairs of texels.
-
-    Args:
-        target: What to factor.
-        hemisphere: The texels of both sides.
-        supersampling: Directions along an edge of a texel.
-    """
-    nodes, solid_angles = hemisphere.nodes(supersampling)
-    indices, hats = hemisphere.taps(nodes)
-    light_weights = solid_angles * target.weight(nodes)
-    single, texels = torch.float32, hemisphere.num_texels
-    total = torch.zeros(texels, target.num_colours, len(target.brdfs), texels, dtype=torch.float64)
-    by_texel = indices.flatten().argsort(stable=True)
-    node_of, starts = (
-        by_texel // 4,
-        torch.searchsorted(indices.flatten()[by_texel], torch.arange(texels)),
-    )
-    light_hats = (hats * light_weights[:, None]).flatten()[by_texel].to(single)
-    energy = 0.0
-    for some, values in target.blocks(nodes.to(single), nodes.to(single)):
-        squares = values.square().sum((1, 2)).double()
-        energy += float(squares @ light_weights @ solid_angles[some])
-        lit = torch.nn.functional.embedding_bag(
-            node_of,
-            values.flatten(0, 2).mT.contiguous(),
-            starts,
-            mode="sum",
-            per_sample_weights=light_hats,
-        )
-        by_view = lit.mT.double().unflatten(0, values.shape[:3])
-        for tap in range(4):
-            share = hats[some, tap] * solid_angles[some]
-            total.index_add_(0, indices[some, tap], by_view * share[:, None, None, None])
-    return Moments(
-        _mass(indices, hats, solid_angles, texels),
-        _mass(indices, hats, light_weights, texels),
-        total.transpose(0, 1),
-        energy,
-    )
-
-
-def interpolated_factors(
-    moments: Moments, hemisphere: HemisphereMap, num_terms: int, *, constants: int = 0
-) -> Factors:
-    """Factors of least error through bilinear lookups, over all pairs of directions.
-
-    Args:
-        moments: Of the target.
-        hemisphere: Its texels.
-        num_terms: Rows in all.
-        constants: How many view functions, the first ones, are constants: 1 in any colour, or 3 in
-            red, green and blue. The other rows are the best beside them.
-    """
-    used = moments.view_mass.diagonal() > 0
-    view_root = _ridged_root(moments.view_mass[used][:, used])
-    light_root = _ridged_root(moments.light_mass[used][:, used])
-    between = moments.moments[:, used][..., used]
-    if constants == 3:
-        between = between.expand(3, -1, -1, -1)
-    colours, texels, materials, _ = between.shape
-    # The roots stand on the left of one wide matrix each: light texels of all views at once, then
-    # view texels of all lights.
-    by_light = between.reshape(-1, texels).mT
-    white = torch.linalg.solve_triangular(light_root, by_light, upper=False).mT
-    by_view = white.reshape(colours, texels, -1).transpose(0, 1).flatten(1)
-    white = torch.linalg.solve_triangular(view_root, by_view, upper=False)
-    white = white.unflatten(1, (colours, -1)).transpose(0, 1).flatten(0, 1)
-    tints = torch.eye(3) if constants == 3 else torch.ones(constants, colours)
-    ones = torch.kron(tints.double(), view_root.mT.sum(1))  # constants; views of all colours
-    squares = ones.square().sum(1, keepdim=True)
-    even = ones @ white / squares  # the light functions that go best with them
-    found, singular, rights = _leading(white - ones.mT @ even, num_terms - constants)
-    root = singular.sqrt()
-    view = (found * root).mT.unflatten(1, (colours, texels))
-    view = torch.linalg.solve_triangular(view_root.mT, view.mT, upper=True).mT
-    view = torch.cat([tints.to(view)[..., None].expand(-1, -1, texels), view])
-    light = torch.cat([even, (rights * root).mT]).unflatten(1, (materials, texels)).transpose(0, 1)
-    light = torch.linalg.solve_triangular(light_root.mT, light.mT, upper=True).mT
-    scale = colours / moments.moments.shape[0]
-    return Factors(
-        fill(view, used, hemisphere),
-        fill(light, used, hemisphere),
-        torch.cat([(squares * even.square()).sum(1), singular.square()]),
-        moments.energy * scale,
-    )
 
 
 def fill(
@@ -381,27 +258,7 @@ def _texels(hemisphere: HemisphereMap, supersampling: int) -> Tensor:
     return (steps[:, None] * hemisphere.resolution + steps).flatten()
 
 
-def _mass(
-    indices: Int[Tensor, "nodes 4"],
-    hats: Float[Tensor, "nodes 4"],
-    weights: Float[Tensor, "nodes"],
-    texels: int,
-) -> Float[Tensor, "texels texels"]:
-    """Weighted sums of the products of the hats of all pairs of texels."""
-    pairs = indices[:, :, None] * texels + indices[:, None, :]
-    products = hats[:, :, None] * hats[:, None, :] * weights[:, None, None]
-    flat = weights.new_zeros(texels * texels).index_add(0, pairs.flatten(), products.flatten())
-    return flat.view(texels, texels)
-
-
-def _ridged_root(mass: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
-    """Lower Cholesky factor of a mass matrix with a small ridge."""
-    diagonal = mass.diagonal()
-    ridge = _RIDGE * diagonal + _RIDGE**2 * diagonal.mean()
-    return torch.linalg.cholesky(mass + torch.diag(ridge))
-
-
-def _leading(
+def leading_triplets(
     matrix: Float[Tensor, "a b"], count: int
 ) -> tuple[Float[Tensor, "a terms"], Float[Tensor, "terms"], Float[Tensor, "b terms"]]:
     """Leading singular triplets; a randomised decomposition where it saves time.

@@ -26,12 +26,11 @@ from prt_torch.bases.brdf_factoring import (
     Factors,
     Reflectance,
     Target,
-    bilinear_moments,
     harmonic_factors,
-    interpolated_factors,
     singular_factors,
     symmetric_factors,
 )
+from prt_torch.bases.brdf_moments import bilinear_moments, interpolated_factors
 from prt_torch.bases.hemisphere_map import HemisphereMap, Mapping
 from prt_torch.sphere import to_horizon
 
@@ -137,8 +136,14 @@ class BRDFFactors(nn.Module, ExitBasis):
             raise ValueError(
                 f"expected {max(1, constants)} to {_MOST_TERMS} terms, got {num_terms}"
             )
+        if supersampling is not None and supersampling < 1:
+            raise ValueError(f"expected a supersampling of at least 1, got {supersampling}")
+        if clamp is not None and not clamp > 0:
+            raise ValueError(f"expected a clamp above 0, got {clamp}")
         hemisphere = HemisphereMap(mapping, resolution)
         brdfs = list(brdf) if isinstance(brdf, Sequence) else [brdf]
+        if not brdfs:
+            raise ValueError("expected at least one material, got none")
         target = Target(brdfs, method != "symmetric", math.inf if clamp is None else clamp)
         count = num_terms or _MOST_TERMS
         match method:

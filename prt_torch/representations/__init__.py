@@ -4,6 +4,15 @@ from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.dense import DenseTransfer
 from prt_torch.representations.files import load, save
+from prt_torch.representations.segmented_cpca import SegmentedCPCA
 from prt_torch.representations.wavelet import WaveletTransfer
 
-__all__ = ["CPCA", "DenseTransfer", "Representation", "WaveletTransfer", "load", "save"]
+__all__ = [
+    "CPCA",
+    "DenseTransfer",
+    "Representation",
+    "SegmentedCPCA",
+    "WaveletTransfer",
+    "load",
+    "save",
+]

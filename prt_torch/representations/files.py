@@ -13,11 +13,12 @@ from prt_torch.errors import InputError
 from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.dense import DenseTransfer
+from prt_torch.representations.segmented_cpca import SegmentedCPCA
 from prt_torch.representations.wavelet import WaveletTransfer
 from prt_torch.transfer import Surface
 
 KINDS: dict[str, type[Representation]] = {
-    kind.kind: kind for kind in (CPCA, DenseTransfer, WaveletTransfer)
+    kind.kind: kind for kind in (CPCA, DenseTransfer, SegmentedCPCA, WaveletTransfer)
 }
 """The closed registry of representations: name in configurations and files, to class."""
 

@@ -1,0 +1,245 @@
+"""What a run's configuration may say: every key, its type and its range.
+
+:mod:`prt_torch.config` composes and validates it.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Albedo = tuple[
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+]
+
+
+class SceneConfig(_Section):
+    """What is lit."""
+
+    mesh: str | None = Field(
+        None, min_length=1, description="mesh file; null is the embedded procedural scene"
+    )
+    ground: bool = Field(True, description="put a mesh file on a ground plane")
+    ground_size: float = Field(4.0, gt=0, description="its edge, in horizontal extents of the mesh")
+    ground_resolution: int = Field(48, ge=2, le=2048, description="points along its edge")
+    up: Literal["y", "z"] = Field("y", description="up axis of the mesh file")
+    orientation: Literal["file", "flip", "outward"] = Field("file", description="facing of faces")
+    albedo: Albedo | None = Field(None, description="linear RGB, in place of the file's colours")
+    transform: list[list[float]] | None = Field(None, description="4x4, applied after up")
+
+
+class LightConfig(_Section):
+    """Distant light: names of embedded lights, or files."""
+
+    fit: list[str] = Field(default_factory=list, description="lights that a light prior expects")
+    test: list[str] = Field(..., min_length=1, description="held-out lights that errors are for")
+    layout: Literal["auto", "latlong", "vertical_cross", "horizontal_cross"] = "auto"
+    rotation_degrees: float = Field(0.0, description="turns every light about +y")
+    exposure: float = Field(0.0, ge=-100, le=100, description="stops")
+
+
+class PartConfig(_Section):
+    """What a part of the scene is made of."""
+
+    lambertian: bool = Field(True, description="reflects diffusely with the albedo of the mesh")
+    glossy: dict[str, Any] | None = Field(None, description="a reflectance model: name, parameters")
+    medium: str | None = Field(None, description="a translucent inside, by name of a preset")
+    millimetres_per_unit: float = Field(1.0, gt=0, description="size of a mesh unit")
+
+
+class MaterialConfig(PartConfig):
+    """What the object is made of; the ground is Lambertian."""
+
+    parts: dict[str, PartConfig] = Field(
+        default_factory=dict, description="other materials, by name of a part of the mesh"
+    )
+
+
+class TransferConfig(_Section):
+    """What is baked."""
+
+    light_basis: Literal["sh", "cube", "haar"] = "sh"
+    order: int = Field(6, ge=1, le=64, description="bands of spherical harmonics")
+    light_resolution: int | None = Field(
+        None, ge=1, le=512, description="texels along a light cube's edge; null is resolution"
+    )
+    light_segments: int = Field(
+        2, ge=1, le=512, description="Haar segments along a light cube's edge; 1 is whole faces"
+    )
+    resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
+    supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
+    rows: int | None = Field(
+        None, ge=2, le=64, description="exit functions of glossy scenes; null is 24 for sh, else 10"
+    )
+    max_bounces: int = Field(0, ge=0, le=64, description="0 is direct light only")
+    tolerance: float = Field(1e-3, ge=0, lt=1, description="share of the light of a last bounce")
+
+    @model_validator(mode="after")
+    def _rays_fill_whole_bytes(self) -> "TransferConfig":
+        if self.resolution * self.supersampling % 2:
+            raise PydanticCustomError(
+                "odd",
+                "resolution times supersampling must be even, got {resolution} times {factor}",
+                {"resolution": self.resolution, "factor": self.supersampling},
+            )
+        return self
+
+    @property
+    def light_texels(self) -> int:
+        """Texels along an edge of the cube that light is given on."""
+        return self.light_resolution or self.resolution
+
+    @model_validator(mode="after")
+    def _light_texels_are_whole(self) -> "TransferConfig":
+        if self.light_basis == "sh":
+            return self
+        texels, fine = self.light_texels, self.resolution * self.supersampling
+        if fine % texels:
+            raise PydanticCustomError(
+                "light_resolution",
+                "light_resolution must divide all {fine} rays along an edge, got {texels}",
+                {"texels": texels, "fine": fine},
+            )
+        segment, rest = divmod(texels, self.light_segments)
+        if self.light_basis == "haar" and (rest or segment.bit_count() != 1):
+            raise PydanticCustomError(
+                "light_segments",
+                "light_resolution {texels} over light_segments {segments} must be a power of two",
+                {"texels": texels, "segments": self.light_segments},
+            )
+        return self
+
+
+class CPCAConfig(_Section):
+    """Sloan et al. 2003."""
+
+    name: Literal["cpca"] = "cpca"
+    num_clusters: int = Field(128, ge=1)
+    rank: int = Field(4, ge=1, description="vectors a cluster beside its mean")
+    method: Literal["iterative", "static", "adaptive"] = "iterative"
+    affine: bool = Field(True, description="clusters have means")
+    max_error: float | None = Field(None, gt=0, description="choose clusters and rank by error")
+    max_bytes: int | None = Field(None, ge=1, description="choose clusters and rank by bytes")
+    max_relight_seconds: float | None = Field(None, gt=0, description="choose them by time")
+    reclassify: float = Field(0.0, ge=0, le=1, description="share of error to lower overdraw for")
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The limit that chooses clusters and rank, if one is given."""
+        given = {
+            "max_error": self.max_error,
+            "max_bytes": self.max_bytes,
+            "max_relight_seconds": self.max_relight_seconds,
+        }
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
+    def label(self) -> str:
+        """Name of the result."""
+        method = "" if self.method == "iterative" else f" {self.method}"
+        linear = "" if self.affine else " linear"
+        moved = f" reclassified {self.reclassify:g}" if self.reclassify else ""
+        size = f"{self.num_clusters}x{self.rank}"
+        for limit, value in self.limits.items():
+            size = f"{limit.removeprefix('max_')} {value:g}"
+        return f"{self.name}{method}{linear} {size}{moved}"
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> "CPCAConfig":
+        if len(self.limits) > 1:
+            raise PydanticCustomError(
+                "limits",
+                "at most one limit may be given, got {names}",
+                {"names": list(self.limits)},
+            )
+        if self.limits and not self.affine:
+            raise PydanticCustomError("limits", "a limit chooses affine clusters only")
+        return self
+
+
+class SegmentedCPCAConfig(_Section):
+    """Liu et al. 2004."""
+
+    name: Literal["segmented_cpca"] = "segmented_cpca"
+    points_per_cluster: int = Field(200, ge=1, description="mean size of a segment's clusters")
+    rank: int = Field(16, ge=1, description="vectors a cluster")
+    bits: int = Field(16, ge=2, le=16, description="of a code, with its sign")
+    quantisation_share: float = Field(0.05, ge=0, description="of the error that rounding may add")
+
+    @property
+    def label(self) -> str:
+        """Name of the result."""
+        return f"{self.name} {self.points_per_cluster}x{self.rank}"
+
+
+class WaveletConfig(_Section):
+    """Wang et al. 2004."""
+
+    name: Literal["wavelet"] = "wavelet"
+    num_terms: int = Field(96, ge=1, description="light coefficients kept of a point and row")
+    codes: Literal["11/11/10", "16", "8", "float"] | None = Field(
+        None, description="bits of a value; null is 11/11/10 for three channels, 16 for one"
+    )
+    light_threshold: float = Field(
+        0.0, ge=0, lt=1, description="light coefficients below this share of the largest are cut"
+    )
+
+    @property
+    def label(self) -> str:
+        """Name of the result."""
+        codes = f" {self.codes}" if self.codes else ""
+        cut = f" light above {self.light_threshold:g}" if self.light_threshold else ""
+        return f"{self.name} {self.num_terms}{codes}{cut}"
+
+
+RepresentationConfig = Annotated[
+    CPCAConfig | SegmentedCPCAConfig | WaveletConfig, Field(discriminator="name")
+]
+"""The closed registry of representations that a run can fit, told apart by ``name``."""
+
+
+class FitConfig(_Section):
+    """Refinement by gradients after the closed form."""
+
+    optimizer: Literal["lbfgs", "adam"] = "lbfgs"
+    max_steps: int = Field(10, ge=0, description="0 keeps the closed form")
+    metric: Literal["l2", "light_prior"] = Field("l2", description="what errors are worth")
+
+
+class PreviewConfig(_Section):
+    """Pictures."""
+
+    width: int = Field(480, ge=16, le=8192)
+    height: int = Field(360, ge=16, le=8192)
+    opengl: bool = Field(True, description="also draw with pyrender where EGL exists")
+
+
+class RunConfig(_Section):
+    """One complete run."""
+
+    scene: SceneConfig
+    material: MaterialConfig
+    light: LightConfig
+    transfer: TransferConfig
+    representation: RepresentationConfig = Field(..., description="the one to fit")
+    representations: list[RepresentationConfig] = Field(
+        default_factory=list, description="several to fit; wins over representation"
+    )
+    fit: FitConfig
+    preview: PreviewConfig
+    out: str | None = Field(None, description="run folder; null is runs/SCENE-HASH")
+    cache: str = Field(..., min_length=1, description="folder of bakes")
+    memory_budget: int = Field(4 * 2**30, ge=2**24, description="bytes a computation may take")
+    seed: int = Field(0, ge=0, lt=2**63)
+
+    @property
+    def fitted(self) -> list[RepresentationConfig]:
+        """The representations that this run fits."""
+        return self.representations or [self.representation]
