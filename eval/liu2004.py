@@ -38,7 +38,7 @@ MATERIALS: dict[str, BRDF | None] = {
     "schlick": Schlick(f0=0.8, roughness=0.2, isotropy=0.2),
     "diffuse": None,
 }
-PAPER = {  # segments seen, clusters, CPCA, wavelet and total size in percent, squared error in percent
+PAPER = {  # segments seen, clusters, CPCA, wavelet and total size, squared error; in percent
     "glossy": ("56.0", "763", "4.43", "29.5", "1.31", "0.20"),
     "diffuse": ("57.6", "2260", "8.16", "50.0", "4.17", "0.02"),
 }
@@ -187,8 +187,8 @@ def turning_light(transfer: TransferTensor, model: SegmentedCPCA, mesh: Mesh) ->
             frames = [seen(dense, light) for light in kept]
             table.add_row(f"uncompressed, {keep} largest by area", *_sequence(frames, expected))
     table.caption = (
-        "relative RMS of radiance against the uncompressed tensor; flicker is the RMS change of the "
-        "error image from frame to frame, over that of the picture"
+        "relative RMS of radiance against the uncompressed tensor; flicker is the RMS change of "
+        "the error image from frame to frame, over that of the picture"
     )
     return table
 

@@ -1,5 +1,6 @@
 """Segmented CPCA: the contract, plain loops as second implementations, the paper's extremes."""
 
+import numpy as np
 import pytest
 import torch
 from contract import Contract, contract_by_dense, random_transfer, relative
@@ -64,7 +65,7 @@ def test_evaluation_at_rest_is_the_contraction_of_dense(dtype, channels, rows):
     values[:50, ..., :8] = 0.0
     values[:, ..., 8:16] *= torch.rand(200, 1, 1, 1, dtype=dtype).round()
     transfer = TransferTensor.from_dense(values)
-    model = SegmentedCPCA.from_transfer(transfer, num_segments=3, points_per_cluster=12, rank=5)
+    model = SegmentedCPCA.from_transfer(transfer, num_segments=3, points_per_cluster=8, rank=5)
     assert set(model.labels.flatten().clamp_max(2).tolist()) == {0, 1, 2}
     light = torch.randn(3, 24, 3, dtype=dtype)
     with torch.no_grad():
@@ -214,22 +215,30 @@ def test_coding_of_columns_against_a_loop():
     codes[torch.rand(600, 7, generator=generator) < 0.7] = 0
     codes[:300, 2] = -128  # a full column of codes that look like the mark
     codes[5, 3], codes[6, 3], codes[7, 3] = 32767, -32767, -127
+    codes[:, 4] *= torch.rand(600, generator=generator) < 0.2  # few enough to be listed
     sparse = encode_columns(codes)
-    counts, rows, values = [], [], []
+    counts, rows, marks, values = [], [], [], []
     for start in range(0, 600, 255):
         for column in codes[start : start + 255].T:
             found = [(row, int(code)) for row, code in enumerate(column) if code]
             counts.append(len(found))
-            rows += [row for row, _ in found]
+            if len(found) <= 32:
+                rows += [row for row, _ in found]
+            else:
+                bits = np.zeros(256, np.uint8)
+                bits[[row for row, _ in found]] = 1
+                marks.append(np.packbits(bits).tolist())
             values += [code for _, code in found]
     assert sparse.counts.tolist() == counts
     assert sparse.rows.tolist() == rows
+    assert len(rows) > 0
+    assert sparse.marks.tolist() == marks
     marked = [code if abs(code) < 128 else -128 for code in values]
     assert sparse.codes.tolist() == marked
     assert sparse.escapes.tolist() == [code for code in values if abs(code) >= 128]
     empty = encode_columns(codes[:0])
     both = [encode_columns(codes[:100]), empty, sparse]
-    fields = ("counts", "rows", "codes", "escapes")
+    fields = ("counts", "rows", "marks", "codes", "escapes")
     joined = SparseColumns(*(torch.cat([getattr(one, name) for one in both]) for name in fields))
     assert torch.equal(decode_columns(joined, [100, 0, 600], 7), torch.cat([codes[:100], codes]))
 

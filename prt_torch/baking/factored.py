@@ -16,8 +16,10 @@ Source:
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,17 +27,19 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from prt_torch import store
+from prt_torch.assets.brdf import BRDF
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.projection import pieces, project_points
 from prt_torch.baking.visibility import Progress, VisibilityField
-from prt_torch.bases import BRDFFactors, CubeDirections, Haar
+from prt_torch.bases import BRDFFactors, CubeDirections, Haar, HemisphereMap
 from prt_torch.errors import InputError
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles, frame_from_normal
 from prt_torch.transfer import Surface, TransferTensor
 
 _SHARD_BYTES = 2**26
 _POINTS_AT_ONCE = 16
-_ALGORITHM = 1  # raise it when the same inputs would give other values
+_ALGORITHM = 2  # raise it when the same inputs would give other values
+_FACTORING = 1  # likewise of factors
 
 
 @dataclass(frozen=True)
@@ -48,11 +52,28 @@ class FactoredReflection:
         materials: ``"points"``: which material of ``factors`` each point has; -1 for none.
         lambertian: ``"points colours"``: albedo that enters the constant rows; no colours where
             there is none.
+
+    Raises:
+        ValueError: If they do not fit together, or the light side of the factors are harmonics.
     """
 
     factors: BRDFFactors
     materials: Int[Tensor, "points"]
     lambertian: Float[Tensor, "points colours"]
+
+    def __post_init__(self) -> None:
+        factors, colours = self.factors, self.lambertian.shape[1]
+        if factors.light_order is not None:
+            raise ValueError(
+                f"expected light functions in maps, got harmonics of {factors.light_order} bands"
+            )
+        if colours and colours != factors.num_constants:
+            raise ValueError(f"expected {colours} constants, got {factors.num_constants}")
+        if int(self.materials.max()) >= factors.num_materials:
+            raise ValueError(
+                f"expected factors of {int(self.materials.max()) + 1} materials, "
+                f"got {factors.num_materials}"
+            )
 
     def digest(self) -> str:
         """SHA-256 of everything that reflected light follows from."""
@@ -91,11 +112,7 @@ def project_factored(
         InputError: If the visibility is not a multiple of the light's resolution, or the cache
             cannot be written or is damaged.
     """
-    if visibility.resolution % light_basis.resolution:
-        raise InputError(
-            f"{light_basis.name} needs a visibility resolution that is a multiple of "
-            f"{light_basis.resolution}, got {visibility.resolution}"
-        )
+    check_resolution(light_basis, visibility.resolution)
     project = functools.partial(
         _project_shard, _Projector(visibility, reflection, light_basis), mesh
     )
@@ -117,6 +134,60 @@ def project_factored(
         cache=cache,
         progress=progress,
     )
+
+
+def kept_factors(
+    brdfs: Sequence[BRDF], *, num_terms: int, constants: Literal[0, 1, 3], cache: Path | None
+) -> BRDFFactors:
+    """Factors of materials, made once: a bake and what relights it must share them to the bit.
+
+    Singular vectors may come out with other signs on other numbers of threads.
+
+    Args:
+        brdfs: The materials.
+        num_terms: Rows.
+        constants: How many of them are constants.
+        cache: Folder of bakes; None makes them anew.
+
+    Raises:
+        InputError: If the cache cannot be written or is damaged.
+    """
+
+    def make(_: slice) -> tuple[dict[str, Tensor], dict[str, int | float]]:
+        made = BRDFFactors.from_brdf(brdfs, num_terms=num_terms, constants=constants)
+        maps = {"view": made.view_values, "light": made.light_values}
+        tensors = {name: values.detach()[None] for name, values in maps.items()}
+        return {**tensors, "rms": torch.tensor([made.rms], dtype=torch.float64)}, {}
+
+    inputs = {
+        "brdfs": [brdf.describe() for brdf in brdfs],
+        "num_terms": num_terms,
+        "constants": constants,
+        "algorithm": _FACTORING,
+    }
+    folder = None if cache is None else cache / f"factors-{store.digest(inputs)[:16]}"
+    found = store.build_sharded(make, rows=1, rows_per_shard=1, inputs=inputs, folder=folder)
+    view, light, rms = (found.tensors[name][0:1][0] for name in ("view", "light", "rms"))
+    factors = BRDFFactors(view, light, HemisphereMap(), num_constants=constants)
+    factors.rms = float(rms)
+    return factors
+
+
+def check_resolution(light_basis: CubeDirections | Haar, resolution: int) -> None:
+    """Check that rays divide the texels of a light evenly.
+
+    Args:
+        light_basis: Light by texels, or their wavelets.
+        resolution: Sub-texels along an edge of a face of the visibility cube.
+
+    Raises:
+        InputError: If they do not.
+    """
+    if resolution % light_basis.resolution:
+        raise InputError(
+            f"{light_basis.name} needs a visibility resolution that is a multiple of "
+            f"{light_basis.resolution}, got {resolution}"
+        )
 
 
 def _project_shard(projector: "_Projector", mesh: Mesh, rows: slice) -> dict[str, Tensor]:

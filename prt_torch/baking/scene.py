@@ -22,7 +22,12 @@ from prt_torch.assets.brdf import Lambert, Sum
 from prt_torch.assets.material import Material, assign_materials
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.direct import project_diffuse, shared_reflectance
-from prt_torch.baking.factored import FactoredReflection, project_factored
+from prt_torch.baking.factored import (
+    FactoredReflection,
+    check_resolution,
+    kept_factors,
+    project_factored,
+)
 from prt_torch.baking.glossy import project_glossy
 from prt_torch.baking.interreflection import Bounces, interreflect
 from prt_torch.baking.reflection import Reflection, diffuse_reflection, glossy_reflection
@@ -30,6 +35,8 @@ from prt_torch.baking.subsurface import scatter
 from prt_torch.baking.visibility import Progress, VisibilityField, trace_visibility
 from prt_torch.bases import (
     BRDFFactors,
+    CubeDirections,
+    Haar,
     HemisphericalHarmonics,
     LightBasis,
     SphericalHarmonics,
@@ -68,10 +75,11 @@ def bake(
         light_basis: What to expand the light in; spherical harmonics of order 6 if not given.
         num_rows: Exit functions of a scene with glossy materials: 24 hemispherical harmonics if
             light is in spherical harmonics, else 10 BRDF factors (12 where Lambertian colours
-            differ between glossy points), unless given.
+            differ between glossy points, or a medium is coloured), unless given.
         factors: BRDF factors of the glossy materials, in the order of ``materials``, in place of
             those that are made; only where light is not in spherical harmonics. Their first view
-            function must be the constant where any part has a Lambertian or a translucent side.
+            functions must be constants where any part has a Lambertian or a translucent side: one,
+            or three where their colours differ.
         max_bounces: Most bounces between points; 0 for direct light only.
         tolerance: A bounce that adds less than this share of the exit radiance is the last.
         resolution: Texels along an edge of a face of the visibility cube.
@@ -85,8 +93,10 @@ def bake(
         Diffuse transfer of one row, or rows of an exit basis where any part is glossy.
 
     Raises:
-        InputError: If the cache cannot be written or is damaged, a part is unknown, or bounces are
-            asked for of glossy materials whose light is not in spherical harmonics.
+        InputError: If the cache cannot be written or is damaged, a part is unknown, bounces are
+            asked for of glossy materials whose light is not in spherical harmonics, the rays are
+            not a multiple of the light's texels, or there are too few rows.
+        ValueError: If ``factors`` do not fit the scene, or it needs none.
     """
     basis = light_basis or SphericalHarmonics(6)
     found, index = assign_materials(mesh, materials)
@@ -96,8 +106,19 @@ def bake(
         raise InputError(
             f"max_bounces: glossy materials bounce light in spherical harmonics, not {basis.name}"
         )
-    tell = stages or (lambda _: lambda done, total: None)
+    if factors is not None and not factored:
+        raise ValueError("expected factors only of glossy materials without spherical harmonics")
+    if isinstance(basis, CubeDirections | Haar):
+        check_resolution(basis, resolution * supersampling)
     folder = None if cache is None else Path(cache)
+    reflection, reflectance = _diffuse(mesh, found, index)
+    if factored:
+        if any(material.medium for material in found):  # one reflectance for all terms
+            reflectance = torch.ones(1, 3)
+        reflection = _factored(mesh, found, index, reflectance, num_rows, factors, folder)
+    elif glossy:
+        reflection = _glossy(mesh, found, index, num_rows or _HARMONICS)
+    tell = stages or (lambda _: lambda done, total: None)
     visibility = trace_visibility(
         mesh,
         resolution=resolution,
@@ -105,13 +126,6 @@ def bake(
         cache=folder,
         progress=tell("trace visibility"),
     )
-    reflection, reflectance = _diffuse(mesh, found, index)
-    if factored:
-        if any(material.medium for material in found):  # one reflectance for all terms
-            reflectance = torch.ones(1, 3)
-        reflection = _factored(mesh, found, index, reflectance, num_rows, factors)
-    elif glossy:
-        reflection = _glossy(mesh, found, index, num_rows or _HARMONICS)
     scene = _Scene(mesh, visibility, basis, reflection, reflectance, folder, memory_budget, tell)
     direct = scene.direct()
     terms, facts = [direct], {**direct.provenance, **_quality(reflection)}
@@ -262,11 +276,12 @@ def _factored(
     reflectance: Float[Tensor, "points_or_one rgb"],
     num_rows: int | None,
     factors: BRDFFactors | None,
+    cache: Path | None,
 ) -> FactoredReflection:
     """Reflection by BRDF factors.
 
     Where the Lambertian side of a glossy material has one albedo, it is factored with the rest, so
-    its colour costs no channels.
+    its colour costs no channels. Neither does that of a medium, whose light enters the constants.
     """
     diffuse, _ = _sides(materials, index)
     brdfs, numbers = [], torch.full((len(materials),), -1)
@@ -281,13 +296,22 @@ def _factored(
         else:
             brdfs.append(material.glossy)
     albedo = mesh.albedo.to(torch.float32) * diffuse[:, None]
-    lambertian = colour_channels(albedo / torch.where(reflectance > 0, reflectance, 1.0))
-    if not bool(lambertian.any()) and not any(material.medium for material in materials):
+    # Where the reflectance that stays a factor is zero, anything may stand beside it: no colour.
+    share = albedo / torch.where(reflectance > 0, reflectance, 1.0)
+    lambertian = colour_channels(torch.where(reflectance > 0, share, diffuse[:, None].to(share)))
+    media = [material.medium for material in materials if material.medium]
+    if not all(medium.is_grey() for medium in media):
+        lambertian = lambertian.expand(-1, 3)
+    elif not media and not bool(lambertian.any()):
         lambertian = lambertian[:, :0]
     constants: Any = lambertian.shape[1]
     if factors is None:
-        num_rows = num_rows or _FACTORS + max(0, constants - 1)
-        factors = BRDFFactors.from_brdf(brdfs, num_terms=num_rows, constants=constants)
+        num_rows = _FACTORS + max(0, constants - 1) if num_rows is None else num_rows
+        if num_rows < max(1, constants):
+            raise InputError(
+                f"num_rows: the materials need at least {max(1, constants)}, got {num_rows}"
+            )
+        factors = kept_factors(brdfs, num_terms=num_rows, constants=constants, cache=cache)
     elif (factors.num_materials, factors.num_constants) != (len(brdfs), constants):
         raise ValueError(
             f"expected factors of {len(brdfs)} materials with {constants} constants, got "

@@ -84,8 +84,21 @@ def iterate(
     rank: int,
     affine: bool,
     generator: torch.Generator,
+    *,
+    doubling: bool = False,
 ) -> Int[Tensor, "points"]:
-    """Move points between clusters, whose vectors grow one by one to ``rank``."""
+    """Move points between clusters, whose vectors grow to ``rank``.
+
+    Args:
+        data: The points, less their mean where the subspaces are affine.
+        labels: Clusters to begin with.
+        num_clusters: How many there are.
+        rank: Vectors of each at the end.
+        affine: Whether clusters have means.
+        generator: Source of randomness.
+        doubling: Double the number of vectors in place of adding one: of rank 16, a third of the
+            time for 7 % more error.
+    """
     axes = PrincipalAxes(data)
     vectors = data.new_zeros(num_clusters, 0, 0)
     points, error = axes.points, axes.energy
@@ -93,11 +106,14 @@ def iterate(
         labels, _ = sort_labels(labels, num_clusters)
         seen = Subspaces(points, labels, data.new_zeros(num_clusters, data.shape[1], 0), True)
         error = float(seen.spread().double().sum())
-    for size in range(1, rank + 1):
+    size = 0
+    while size < rank:
+        size = min(rank, max(1, 2 * size)) if doubling else size + 1
         count = axes.enough(error, least=size)
         points = axes.leading(count)
         vectors = torch.nn.functional.pad(vectors, (0, 0, 0, count - vectors.shape[1]))
-        fresh = torch.randn(num_clusters, count, 1, generator=generator).to(data)
+        more = size - vectors.shape[2]
+        fresh = torch.randn(num_clusters, count, more, generator=generator).to(data)
         vectors = torch.cat([vectors, fresh], dim=2)
         turns = _LAST_TURNS if size == rank else _TURNS_PER_RANK
         labels, vectors, within = _take_turns(points, labels, vectors, affine, turns)

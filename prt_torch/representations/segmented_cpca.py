@@ -16,6 +16,9 @@ Source:
 """
 
 import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -26,6 +29,7 @@ from torch import Tensor, nn
 from prt_torch.metric import Metric
 from prt_torch.quantize import straight_through
 from prt_torch.representations.base import Representation
+from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.segmented_coding import pack, unpack
 from prt_torch.representations.segmented_encoding import (
     CULLED,
@@ -153,9 +157,11 @@ class SegmentedCPCA(Representation):
         metric = metric or Metric.l2(transfer)
         generator = generator or torch.Generator().manual_seed(0)
         size = transfer.num_coeffs // count
-        codings, statistics = [], []
-        blocks = nonzero_blocks(transfer, count, memory_budget)
-        for place, (points, values) in enumerate(blocks):
+        seeds = torch.randint(2**31 - 1, (count,), generator=generator).tolist()
+
+        def encode(
+            place: int, points: Tensor, values: Tensor
+        ) -> tuple[Encoding, SegmentStatistics]:
             start = time.perf_counter()
             own = slice(place * size, (place + 1) * size)
             local = segment_metric(metric, own, transfer.num_coeffs)
@@ -166,14 +172,16 @@ class SegmentedCPCA(Representation):
                 points_per_cluster=points_per_cluster,
                 rank=rank,
                 metric=local,
-                generator=generator,
+                generator=torch.Generator().manual_seed(seeds[place]),
             )
             coding = quantise_segment(encoding, local, quantisation_share, bits)
-            codings.append(coding)
             seconds = time.perf_counter() - start
-            statistics.append(_statistics(encoding, coding, transfer, count, seconds))
-        found = cls(join(codings), transfer.surface, tuple(transfer.values.shape))
-        found.statistics = statistics
+            return coding, _statistics(encoding, coding, transfer, count, seconds)
+
+        blocks = nonzero_blocks(transfer, count, memory_budget)
+        codings, statistics = zip(*_side_by_side(encode, blocks), strict=True)
+        found = cls(join(list(codings)), transfer.surface, tuple(transfer.values.shape))
+        found.statistics = list(statistics)
         return found
 
     def train(self, mode: bool = True) -> "SegmentedCPCA":
@@ -320,6 +328,25 @@ class SegmentedCPCA(Representation):
     def condition(self) -> float:
         """Largest over smallest kept singular value, of the worst cluster; NaN if loaded."""
         return self._condition
+
+
+def _side_by_side(
+    encode: Callable[[int, Tensor, Tensor], tuple[Encoding, SegmentStatistics]],
+    blocks: Iterable[tuple[Tensor, Tensor]],
+) -> Iterator[tuple[Encoding, SegmentStatistics]]:
+    """Encode segments in order, as many at a time as torch uses threads, each with one of them.
+
+    Most steps are too small for threads of their own; results do not depend on their number.
+    """
+    workers = torch.get_num_threads()
+    waiting: deque[Future[tuple[Encoding, SegmentStatistics]]] = deque()
+    with one_thread(), ThreadPoolExecutor(workers) as pool:
+        for place, (points, values) in enumerate(blocks):
+            waiting.append(pool.submit(encode, place, points, values))
+            if len(waiting) >= workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def _check(

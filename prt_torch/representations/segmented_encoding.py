@@ -189,7 +189,9 @@ def _cluster(
         if beyond <= _BEYOND * _first_error(low, labels, found, rank, generator):
             break
         dimensions *= 2
-    return iterate(low, labels, found, rank, False, generator) if found > 1 else labels
+    if found == 1:
+        return labels
+    return iterate(low, labels, found, rank, False, generator, doubling=True)
 
 
 def _project(
