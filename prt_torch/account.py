@@ -14,7 +14,7 @@ from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.report import write_html
-from prt_torch.representations import CPCA, DenseTransfer, Representation
+from prt_torch.representations import CPCA, DenseTransfer, Representation, SegmentedCPCA
 from prt_torch.representations.cpca_relabel import coherence
 from prt_torch.settings import PreviewConfig
 from prt_torch.sphere import rotation_about_up
@@ -76,6 +76,7 @@ def write_report(
     )
     report = _facts(inputs, transfer)
     report["left_out"] = _left_out(inputs, transfer, opengl_missing=not opengl_drew)
+    report["left_out"] += _left_out_segments(transfer, fitted)
     report["results"] = []
     for one in fitted:
         lost = float(errors[one.name].sum())
@@ -238,6 +239,25 @@ def _left_out(
             }
         )
     return left_out
+
+
+def _left_out_segments(transfer: TransferTensor, fitted: list[Fitted]) -> list[dict[str, Any]]:
+    """Segments of the light that points see nothing of."""
+    shares = [
+        one.representation.culled_share
+        for one in fitted
+        if isinstance(one.representation, SegmentedCPCA)
+    ]
+    if not shares:
+        return []
+    values = transfer.num_bytes - transfer.surface.reflectance.nbytes
+    return [
+        {
+            "what": f"{100 * shares[0]:.0f} % of all pairs of a point and a segment of the light",
+            "why": "the point sees nothing of the segment",
+            "saved_bytes": round(shares[0] * values),
+        }
+    ]
 
 
 def _left_out_light(transfer: TransferTensor) -> list[dict[str, Any]]:

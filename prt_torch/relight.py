@@ -96,7 +96,7 @@ class Relighter(nn.Module):
         views: Float[Tensor, "views *points 3"] | None = None,
         frames: Float[Tensor, "points 3 3"] | None = None,
     ) -> Float[Tensor, "batch views points rgb"]:
-        """Radiance towards views of what :meth:`transferred` gave: a change of view costs only this.
+        """Radiance of what :meth:`transferred` gave: a change of view costs only this.
 
         Args:
             transferred: Of a batch of lights.

@@ -273,7 +273,8 @@ def _fit_one(
     checkpoint = path.with_suffix(".checkpoint")
     if record.exists() and path.exists():
         checkpoint.unlink(missing_ok=True)
-        return Fitted(name, load(path), **store.read_json(record))
+        model = load(path, geometry=transfer.surface)
+        return Fitted(name, model, **store.read_json(record))
     start = time.perf_counter()
     representation = _closed_form(wanted, config, inputs, transfer, metric)
     result = fit(

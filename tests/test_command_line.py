@@ -430,6 +430,33 @@ class TestWholeRun:
         assert [result["name"] for result in report["results"]] == ["cpca 8x1", "cpca 4x4"]
         check_manifest(Path("out"))
 
+    def test_all_frequency_glossy(self):
+        """Segmented CPCA and wavelets of one bake in BRDF factors; started again, it reads them."""
+        write("ball.obj", obj())
+        chosen = (
+            "transfer=haar",
+            "transfer.rows=4",
+            "material.glossy={name: ggx, f0: 0.5, roughness: 0.4}",
+            "representation=segmented_cpca",
+            "representations=[{name: segmented_cpca, rank: 4, points_per_cluster: 20},"
+            " {name: wavelet, num_terms: 16}]",
+        )
+        kept = [one for one in TINY if not one.startswith("representation.")]
+        reports = []
+        for _ in range(2):
+            assert MAINS[FIT](["scene.mesh=ball.obj", "out=out", *kept, *chosen]) == 0
+            reports.append(json.loads(Path("out/report.json").read_text()))
+        first, second = reports
+        assert first["results"][0]["transfer_error"] < 0.05
+        assert [one["bytes"] for one in first["results"]] == [
+            one["bytes"] for one in second["results"]
+        ]
+        assert first["scene"]["rows"] == 4
+        assert 0 < first["bake"]["factor_error"] < 1
+        assert second["bake"]["cached"] is True
+        assert any("segment" in entry["what"] for entry in first["left_out"])
+        check_manifest(Path("out"))
+
     def test_bake_then_fit(self, capfd):
         write("my ball = round.obj", obj())
         mesh = "'my ball = round.obj'"

@@ -22,7 +22,7 @@ from prt_torch.baking import (
     project_glossy,
     trace_visibility,
 )
-from prt_torch.bases import CubeDirections, HemisphericalHarmonics, SphericalHarmonics, sh
+from prt_torch.bases import HemisphericalHarmonics, SphericalHarmonics, sh
 from prt_torch.errors import InputError
 from prt_torch.evaluate import dense_radiance, seen_from
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles
@@ -209,11 +209,6 @@ def test_materials_by_part():
     with pytest.raises(InputError, match="no part 'door'"):
         assign_materials(scene, {"door": shiny})
     assert assign_materials(scene, None)[0] == [Material()]
-
-
-def test_glossy_materials_need_spherical_harmonics():
-    with pytest.raises(InputError, match="need light in spherical harmonics"):
-        bake(bumpy(3), materials=Material(glossy=PHONG), light_basis=CubeDirections(4))
 
 
 def test_subsurface_and_gloss_add_up():

@@ -226,7 +226,10 @@ def harmonic_factors(
     views, used = hemisphere.centres()
     lights, solid_angles = sh.hemisphere_quadrature(4 * max(order, hemisphere.resolution) - 1)
     weighted = sh.evaluate(lights, order) * solid_angles[:, None]
-    projected = [values @ weighted for _, values in target.blocks(views[used], lights)]
+    projected, energy = [], 0.0
+    for _, values in target.blocks(views[used], lights):
+        projected.append(values @ weighted)
+        energy += float((values.square() @ solid_angles).sum())  # what no harmonic holds included
     matrix = torch.cat(projected)  # views, colours, materials, harmonics
     colours, materials = matrix.shape[1:3]
     left, singular, right = leading_triplets(
@@ -234,7 +237,7 @@ def harmonic_factors(
     )
     view = fill(left.mT.unflatten(1, (colours, -1)), used, hemisphere)
     light = (right * singular).mT.unflatten(1, (materials, -1)).transpose(0, 1)
-    return Factors(view, light, singular.square(), float(matrix.square().sum()))
+    return Factors(view, light, singular.square(), energy)
 
 
 def fill(

@@ -38,7 +38,7 @@ Method = Literal["interpolated", "singular", "symmetric", "harmonic"]
 
 _CLAMP = 3.0
 _MOST_TERMS = 64
-_GRAM_SUPERSAMPLING = 4
+_LEAST_DEGREE = 95  # of the quadrature of products of two view functions
 
 
 class BRDFFactors(nn.Module, ExitBasis):
@@ -57,8 +57,10 @@ class BRDFFactors(nn.Module, ExitBasis):
             3 in red, green and blue.
 
     Attributes:
-        rms: Relative root mean square error over all pairs of directions, weighted by the cosine,
-            that the closed form expects of itself; None if not known.
+        rms: Relative root mean square error that the closed form expects of itself: over all pairs
+            of directions, weighted by the cosine, for ``interpolated``; of its matrix of texels for
+            ``singular`` and ``symmetric``; over texels of the view and all lights for ``harmonic``.
+            None if not known.
     """
 
     def __init__(
@@ -118,7 +120,8 @@ class BRDFFactors(nn.Module, ExitBasis):
             resolution: Texels along an edge of a map.
             clamp: Largest value of the function factored; None for no limit. It is the BRDF times
                 the cosine, or the BRDF for ``symmetric``.
-            supersampling: Directions along an edge of a texel: 4 for ``singular``, else 2.
+            supersampling: Directions along an edge of a texel: 4 for ``singular``, 2 for
+                ``interpolated``, which takes one more for lights than for views.
             light_order: Bands of the light side of ``harmonic``.
             constants: How many view functions, the first ones, are constants, so that diffuse light
                 can enter the rows exactly: 1 in any colour, or 3 in red, green and blue. The other
@@ -221,7 +224,8 @@ class BRDFFactors(nn.Module, ExitBasis):
 
     def gram(self) -> Float[Tensor, "rows rows"]:
         """Mean over views, and colours, of the products of two view functions, float64."""
-        views, solid_angles = self.hemisphere.nodes(_GRAM_SUPERSAMPLING)
+        degree = max(_LEAST_DEGREE, 4 * self.hemisphere.resolution)
+        views, solid_angles = sh.hemisphere_quadrature(degree)
         values = self.view_values.detach().double().cpu().flatten(0, 1)
         seen = self.hemisphere.lookup(values, views).unflatten(-1, (self.num_rows, -1))
         weights = solid_angles / (2 * math.pi * self.num_channels)

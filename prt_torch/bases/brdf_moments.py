@@ -72,21 +72,27 @@ def bilinear_moments(
 ) -> Moments:
     """Integrate a model against the hats of all pairs of texels.
 
+    No light of the quadrature is the mirror image of a view. On equal grids every view would meet
+    its own, the peak of a narrow lobe would count many times over, and factors of acrylic paint at
+    16 texels came out with an error of 1.2 times the function itself; so they have 0.996.
+
     Args:
         target: What to factor.
         hemisphere: The texels of both sides.
-        supersampling: Directions along an edge of a texel.
+        supersampling: Views along an edge of a texel, and one less than the lights.
     """
-    nodes, solid_angles = hemisphere.nodes(supersampling)
-    indices, hats = hemisphere.taps(nodes)
-    light_weights = solid_angles * target.weight(nodes)
+    views, solid_angles = hemisphere.nodes(supersampling)
+    lights, light_weights = hemisphere.nodes(supersampling + 1)
+    light_weights = light_weights * target.weight(lights)
+    indices, hats = hemisphere.taps(views)
+    light_indices, light_hats = hemisphere.taps(lights)
     single, texels = torch.float32, hemisphere.num_texels
     total = torch.zeros(texels, target.num_colours, len(target.brdfs), texels, dtype=torch.float64)
-    by_texel = indices.flatten().argsort(stable=True)
-    starts = torch.searchsorted(indices.flatten()[by_texel], torch.arange(texels))
-    light_hats = (hats * light_weights[:, None]).flatten()[by_texel].to(single)
+    by_texel = light_indices.flatten().argsort(stable=True)
+    starts = torch.searchsorted(light_indices.flatten()[by_texel], torch.arange(texels))
+    weighted_hats = (light_hats * light_weights[:, None]).flatten()[by_texel].to(single)
     energy = 0.0
-    for some, values in target.blocks(nodes.to(single), nodes.to(single)):
+    for some, values in target.blocks(views.to(single), lights.to(single)):
         squares = values.square().sum((1, 2)).double()
         energy += float(squares @ light_weights @ solid_angles[some])
         lit = torch.nn.functional.embedding_bag(
@@ -94,7 +100,7 @@ def bilinear_moments(
             values.flatten(0, 2).mT.contiguous(),
             starts,
             mode="sum",
-            per_sample_weights=light_hats,
+            per_sample_weights=weighted_hats,
         )
         by_view = lit.mT.double().unflatten(0, values.shape[:3])
         for tap in range(4):
@@ -102,7 +108,7 @@ def bilinear_moments(
             total.index_add_(0, indices[some, tap], by_view * share[:, None, None, None])
     return Moments(
         _mass(indices, hats, solid_angles, texels),
-        _mass(indices, hats, light_weights, texels),
+        _mass(light_indices, light_hats, light_weights, texels),
         total.transpose(0, 1),
         energy,
     )

@@ -180,6 +180,7 @@ def _facts(run: Run) -> str:
         "rays": _count(run.bake.get("rays")),
         "from the cache": "yes" if run.bake.get("cached") else "no",
         "bounces": _bounces(run.bake.get("bounces")),
+        "BRDF factors": _factors(run.bake.get("factor_error")),
     }
     return "".join(
         _fact_card(f"{run.name}: {title}" if run.name else title.capitalize(), facts)
@@ -192,6 +193,11 @@ def _bounces(added: Any) -> str | None:
     if not added:
         return None
     return f"{len(added)}, the last added {error_text(number(added[-1]))} of the light"
+
+
+def _factors(error: Any) -> str | None:
+    """How far factors are from their materials; None where there are none."""
+    return None if error is None else f"off by {error_text(number(error))} RMS"
 
 
 def _fact_card(title: str, facts: Mapping[str, Any]) -> str:

@@ -45,8 +45,13 @@ def save(representation: Representation, path: Path | str) -> None:
     store.write_bytes(checksum_path(path), f"{written['sha256']}  {path.name}\n".encode())
 
 
-def load(path: Path | str) -> Representation:
+def load(path: Path | str, *, geometry: Surface | None = None) -> Representation:
     """Read what :func:`save` wrote.
+
+    Args:
+        path: The file.
+        geometry: Where shading frames and positions come from, which belong to the mesh and are in
+            no file: the surface of the transfer, say. Views of glossy transfer need them.
 
     Raises:
         InputError: If the file or its checksum is missing, damaged, or of an unknown kind.
@@ -71,6 +76,8 @@ def load(path: Path | str) -> Representation:
         exit_basis=exit_basis(header["exit_basis"], of_exit),
         light_basis=light_basis(header["light_basis"]) if header["light_basis"] else None,
         reflectance=tensors.pop("reflectance"),
+        frames=geometry.frames if geometry else None,
+        positions=geometry.positions if geometry else None,
     )
     points, channels, rows, coeffs = header["shape"]
     return KINDS[kind].from_packed(tensors, surface, (points, channels, rows, coeffs))

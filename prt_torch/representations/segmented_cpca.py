@@ -325,6 +325,11 @@ class SegmentedCPCA(Representation):
         }
 
     @property
+    def culled_share(self) -> float:
+        """Share of the points, over all segments, that see nothing of the segment."""
+        return float((self.labels == CULLED).double().mean())
+
+    @property
     def condition(self) -> float:
         """Largest over smallest kept singular value, of the worst cluster; NaN if loaded."""
         return self._condition
