@@ -39,7 +39,7 @@ from prt_torch.transfer import Surface, TransferTensor
 _SHARD_BYTES = 2**26
 _POINTS_AT_ONCE = 16
 _ALGORITHM = 2  # raise it when the same inputs would give other values
-_FACTORING = 1  # likewise of factors
+_FACTORING = 2  # likewise of factors
 
 
 @dataclass(frozen=True)
