@@ -9,7 +9,7 @@ import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
 
 from prt_torch.errors import InputError
-from prt_torch.settings import RunConfig
+from prt_torch.settings import KINDS, RunConfig
 
 USAGE = """\
 usage: python {script} [--config-name NAME] [-m] [KEY=VALUE ...]
@@ -189,11 +189,16 @@ def _first_line(error: Exception) -> str:
 def _describe(error: ValidationError) -> str:
     """The first problem in one line: key, what was expected, what was given."""
     problem = error.errors()[0]
-    key = ".".join(str(part) for part in problem["loc"])
+    # The kind of a representation stands in the place of an error, but not in its key.
+    key = ".".join(str(part) for part in problem["loc"] if part not in KINDS)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    if problem["type"] == "extra_forbidden":
-        *section, _ = problem["loc"]
-        return f"{key}: unknown key; expected one of {', '.join(_keys_of(section))}{more}"
+    match problem["type"]:
+        case "extra_forbidden":
+            *section, _ = problem["loc"]
+            return f"{key}: unknown key; expected one of {', '.join(_keys_of(section))}{more}"
+        case "union_tag_invalid" | "union_tag_not_found":
+            given = problem["input"].get("name") if isinstance(problem["input"], dict) else None
+            return f"{key}.name: expected one of {', '.join(KINDS)}, got {given!r}{more}"
     message = problem["msg"][:1].lower() + problem["msg"][1:]
     if isinstance(problem["input"], dict):  # a whole section would say nothing
         return f"{key}: {message}{more}"
@@ -205,8 +210,11 @@ def _keys_of(section: list[Any]) -> list[str]:
     """The keys that a section of the configuration has."""
     model: Any = RunConfig
     for part in section:
-        if isinstance(part, str) and part in model.model_fields:
-            model = model.model_fields[part].annotation
-            if not hasattr(model, "model_fields"):  # a list of sections
-                model = model.__args__[0]
+        fields = getattr(model, "model_fields", {})
+        if part in KINDS:
+            model = KINDS[part]
+        elif part in fields:
+            model = fields[part].annotation
+        elif not fields:  # a list of sections, or sections by name
+            model = get_args(model)[-1]
     return list(model.model_fields)

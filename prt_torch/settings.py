@@ -202,6 +202,12 @@ class WaveletConfig(_Section):
 RepresentationConfig = Annotated[
     CPCAConfig | SegmentedCPCAConfig | WaveletConfig, Field(discriminator="name")
 ]
+
+KINDS: dict[str, type[_Section]] = {
+    "cpca": CPCAConfig,
+    "segmented_cpca": SegmentedCPCAConfig,
+    "wavelet": WaveletConfig,
+}
 """The closed registry of representations that a run can fit, told apart by ``name``."""
 
 
