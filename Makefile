@@ -34,6 +34,8 @@ lint: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python eval/benchmark.py
+	$(BIN)/python eval/liu2004.py --supersampling=2
+	$(BIN)/python eval/wang2004.py
 
 clean:
 	rm -rf $(VENV) .cache runs

@@ -197,7 +197,9 @@ def _bounces(added: Any) -> str | None:
 
 def _factors(error: Any) -> str | None:
     """How far factors are from their materials; None where there are none."""
-    return None if error is None else f"off by {error_text(number(error))} RMS"
+    return (
+        None if error is None else f"off by {percent_text(number(error))} RMS over all directions"
+    )
 
 
 def _fact_card(title: str, facts: Mapping[str, Any]) -> str:
