@@ -25,7 +25,7 @@ from prt_torch.assets import Mesh, find_environment, load_mesh, procedural_scene
 from prt_torch.assets.brdf import BRDF, CookTorrance, Schlick
 from prt_torch.assets.material import Material
 from prt_torch.baking import bake
-from prt_torch.bases import Haar, LightBasis, haar
+from prt_torch.bases import Haar, LightBasis
 from prt_torch.command import main
 from prt_torch.errors import InputError
 from prt_torch.relight import Relighter
@@ -207,16 +207,9 @@ def _truncated(
 ) -> Float[Tensor, "coeffs rgb"]:
     """Light that lost coefficients in wavelets over whole faces, as the paper has it."""
     whole = Haar(basis.resolution, basis.resolution)
-    faces = whole.project_cube(texels(light, basis), basis.resolution).mT
+    faces = whole.project_cube(basis.radiance(light).mT, basis.resolution).mT
     kept, _ = truncate(faces[None], whole, keep, weights=whole.areas())
-    return basis.project_cube(texels(kept[0], whole), basis.resolution).mT
-
-
-def texels(light: Float[Tensor, "coeffs rgb"], basis: Haar) -> Float[Tensor, "rgb texels"]:
-    """Radiance of cube texels from light coefficients."""
-    across = basis.resolution // basis.segment
-    images = haar.inverse(light.mT.reshape(3, 6, across, across, basis.segment, basis.segment))
-    return images.transpose(3, 4).reshape(3, -1)
+    return basis.project_cube(whole.radiance(kept[0]).mT, basis.resolution).mT
 
 
 def _sequence(frames: list[Tensor], expected: list[Tensor]) -> list[str]:

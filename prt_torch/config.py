@@ -1,8 +1,8 @@
 """A run's configuration: composed by Hydra, validated by pydantic.
 
-Hydra puts ``configs/`` and the overrides of the command line together; the models here say what
-every key means, its type and its range. Whatever is wrong becomes one line that names the key and
-the choices.
+Hydra puts ``configs/`` and the overrides of the command line together; the models of
+:mod:`prt_torch.settings` say what every key means, its type and its range. Whatever is wrong
+becomes one line that names the key and the choices.
 """
 
 import itertools

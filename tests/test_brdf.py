@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from directions import directions, random_directions
 
 from prt_torch.assets.brdf import (
     BRDF,
@@ -66,19 +67,6 @@ COSINES = [1.0, 0.95, 0.7, 0.3, 0.1, 0.03, 0.01, 1e-3]
 
 def label(model) -> str:
     return json.dumps(model.describe()).translate(str.maketrans("", "", '"{} '))[:60]
-
-
-def directions(cosine, azimuth=0.7) -> torch.Tensor:
-    z = torch.as_tensor(cosine, dtype=torch.float64)
-    angle = torch.as_tensor(azimuth, dtype=torch.float64).expand_as(z)
-    level = torch.sqrt((1 - z) * (1 + z))
-    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=-1)
-
-
-def random_directions(count: int, seed: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    z, turn = torch.rand(2, count, generator=generator, dtype=torch.float64)
-    return directions(z.clamp(min=1e-6), 2 * math.pi * turn)
 
 
 def turned(vectors: torch.Tensor, angle: float) -> torch.Tensor:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from directions import directions, random_directions
 
 from prt_torch.assets.brdf import (
     GGX,
@@ -33,19 +34,6 @@ from prt_torch.errors import InputError
 
 RGL_FILES = ["cc_ibiza_sunset", "colodur_napoli_4f", "paper_white"]
 TYPE_CODES = {"u1": 1, "f4": 10, "f8": 11}
-
-
-def directions(cosine, azimuth=0.7) -> torch.Tensor:
-    z = torch.as_tensor(cosine, dtype=torch.float64)
-    angle = torch.as_tensor(azimuth, dtype=torch.float64).expand_as(z)
-    level = torch.sqrt((1 - z) * (1 + z))
-    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=-1)
-
-
-def random_directions(count: int, seed: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    z, turn = torch.rand(2, count, generator=generator, dtype=torch.float64)
-    return directions(z.clamp(min=1e-6), 2 * math.pi * turn)
 
 
 def write_tensor_file(path: Path, fields: dict[str, np.ndarray]) -> Path:

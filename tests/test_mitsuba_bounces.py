@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from smooth_light import smooth_light
 
 from prt_torch.assets import mesh_from_arrays
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking import project_diffuse, trace_visibility
 from prt_torch.baking.interreflection import interreflect
 from prt_torch.baking.reflection import diffuse_reflection
-from prt_torch.bases import SphericalHarmonics, sh
+from prt_torch.bases import SphericalHarmonics
 
 mi = pytest.importorskip("mitsuba", reason="mitsuba is not installed (pip install '.[check]')")
 
@@ -90,23 +91,6 @@ def as_mesh(walls: list[Wall]) -> Mesh:
     )
 
 
-def smooth_light() -> tuple[torch.Tensor, np.ndarray]:
-    """A positive coloured light by its coefficients and as a lat-long image, centre -z."""
-    generator = torch.Generator().manual_seed(3)
-    coefficients = 0.3 * torch.randn(ORDER**2, 3, generator=generator, dtype=torch.float64)
-    coefficients[0] = torch.tensor([4.0, 3.0, 2.5])
-    rows = 256
-    polar = (torch.arange(rows, dtype=torch.float64) + 0.5) * (math.pi / rows)
-    azimuth = (torch.arange(2 * rows, dtype=torch.float64) + 0.5) * (math.pi / rows) - math.pi
-    polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
-    directions = torch.stack(
-        [polar.sin() * azimuth.sin(), polar.cos(), -polar.sin() * azimuth.cos()], dim=-1
-    )
-    image = (sh.evaluate(directions, ORDER) @ coefficients).float().numpy()
-    assert image.min() > 0
-    return coefficients, image
-
-
 def mitsuba_scene(walls: list[Wall], image: np.ndarray):
     # Its image starts at -z where ours has its centre: half a turn about the vertical.
     turn = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
@@ -142,7 +126,7 @@ def test_bounced_light_agrees(make):
     mi.set_variant("scalar_rgb")
     walls = make()
     mesh = as_mesh(walls)
-    coefficients, image = smooth_light()
+    coefficients, image = smooth_light((4.0, 3.0, 2.5), 0.3, ORDER)
     visibility = trace_visibility(mesh, resolution=32, supersampling=2)
     direct = project_diffuse(mesh, visibility, SphericalHarmonics(ORDER)).dense()
     albedo = mesh.albedo.float()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from smooth_light import smooth_light
 
 from prt_torch.assets import Environment, mesh_from_arrays
 from prt_torch.assets.brdf.base import AnalyticBRDF
@@ -77,23 +78,6 @@ def with_middles(facets: np.ndarray, chosen: np.ndarray) -> Mesh:
     normals = mesh.normals.clone()
     normals[len(chosen) :] = 0
     return replace(mesh, normals=normals)
-
-
-def smooth_light() -> tuple[torch.Tensor, np.ndarray]:
-    """A positive coloured light by its coefficients and as a lat-long image, centre -z."""
-    generator = torch.Generator().manual_seed(3)
-    coefficients = 0.4 * torch.randn(ORDER**2, 3, generator=generator, dtype=torch.float64)
-    coefficients[0] = torch.tensor([5.0, 4.5, 4.0])
-    rows = 256
-    polar = (torch.arange(rows, dtype=torch.float64) + 0.5) * (math.pi / rows)
-    azimuth = (torch.arange(2 * rows, dtype=torch.float64) + 0.5) * (math.pi / rows) - math.pi
-    polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
-    directions = torch.stack(
-        [polar.sin() * azimuth.sin(), polar.cos(), -polar.sin() * azimuth.cos()], dim=-1
-    )
-    image = (sh.evaluate(directions, ORDER) @ coefficients).float().numpy()
-    assert image.min() > 0
-    return coefficients, image
 
 
 def mitsuba_scene(facets: np.ndarray, image: np.ndarray):
@@ -161,7 +145,7 @@ def integrals(
 @pytest.mark.slow
 def test_glossy_light_agrees():
     mi.set_variant("scalar_rgb")
-    coefficients, image = smooth_light()
+    coefficients, image = smooth_light((5.0, 4.5, 4.0), 0.4, ORDER)
     facets = ball_in_bowl()
     scene = mitsuba_scene(facets, image)
     mesh = with_middles(facets, seen_facets(scene, facets))

@@ -111,13 +111,15 @@ def bake(
     if isinstance(basis, CubeDirections | Haar):
         check_resolution(basis, resolution * supersampling)
     folder = None if cache is None else Path(cache)
-    reflection, reflectance = _diffuse(mesh, found, index)
+    reflectance = _reflectance(mesh, found, index)
     if factored:
         if any(material.medium for material in found):  # one reflectance for all terms
             reflectance = torch.ones(1, 3)
         reflection = _factored(mesh, found, index, reflectance, num_rows, factors, folder)
     elif glossy:
         reflection = _glossy(mesh, found, index, num_rows or _HARMONICS)
+    else:
+        reflection = diffuse_reflection(mesh.num_points)
     tell = stages or (lambda _: lambda done, total: None)
     visibility = trace_visibility(
         mesh,
@@ -232,10 +234,10 @@ def _quality(reflection: Reflection | FactoredReflection) -> dict[str, Any]:
     return {"unresolved": reflection.unresolved}
 
 
-def _diffuse(
+def _reflectance(
     mesh: Mesh, materials: list[Material], index: Tensor
-) -> tuple[Reflection, Float[Tensor, "points_or_one rgb"]]:
-    """Reflection of a scene without glossy points, and the reflectance that stays a factor.
+) -> Float[Tensor, "points_or_one rgb"]:
+    """The reflectance that stays a factor.
 
     Albedo is a factor of its own where a point is Lambertian and nothing else. Where it is glossy
     too, albedo enters the rows.
@@ -243,8 +245,7 @@ def _diffuse(
     diffuse, glossy = _sides(materials, index)
     albedo = mesh.albedo.to(torch.float32)
     none = ~(diffuse | glossy)[:, None]
-    factor = torch.where((diffuse & ~glossy)[:, None], albedo, (~none).to(albedo))
-    return diffuse_reflection(mesh.num_points), shared_reflectance(factor)
+    return shared_reflectance(torch.where((diffuse & ~glossy)[:, None], albedo, (~none).to(albedo)))
 
 
 def _sides(materials: list[Material], index: Tensor) -> tuple[Tensor, Tensor]:

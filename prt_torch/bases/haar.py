@@ -271,9 +271,14 @@ class Haar(LightBasis):
         self, coefficients: Float[Tensor, "*batch coeffs rgb"], rotation: Float[Tensor, "3 3"]
     ) -> Float[Tensor, "*batch coeffs rgb"]:
         """Radiance at the nearest turned texel centre; approximate (see the class)."""
+        return self._of_radiance(self._cube.rotate(self.radiance(coefficients), rotation))
+
+    def radiance(
+        self, coefficients: Float[Tensor, "*batch coeffs rgb"]
+    ) -> Float[Tensor, "*batch texels rgb"]:
+        """Mean radiance of each texel, ``"6 row col"`` flattened, from light coefficients."""
         texels = inverse(self._images(coefficients.mT)).unflatten(-3, self._segment_grid)
-        radiance = texels.transpose(-3, -2).flatten(-5).mT
-        return self._of_radiance(self._cube.rotate(radiance, rotation))
+        return texels.transpose(-3, -2).flatten(-5).mT
 
     def describe(self) -> dict[str, Any]:
         """``{"name": "haar", "resolution": R, "segment": S}``."""
