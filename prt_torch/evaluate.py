@@ -17,18 +17,18 @@ from prt_torch.representations import DenseTransfer, Representation
 from prt_torch.transfer import Surface, TransferTensor
 
 _BLOCK_BYTES = 2**27
+_ERROR_BYTES = 2**25
 
 
+@torch.no_grad()
 def squared_errors(
     representation: Representation, transfer: TransferTensor
 ) -> Float[Tensor, "points"]:
     """Squared L2 error of each point's transfer over the sphere of light directions, float64."""
     pieces = []
-    with torch.no_grad():
-        for rows, values in transfer.blocks(_BLOCK_BYTES):
-            points = torch.arange(rows.start, rows.stop)
-            difference = representation.dense(points).double() - values
-            pieces.append(transfer.squared_norm_of(difference))
+    for rows, values in transfer.blocks(_ERROR_BYTES):
+        approximated = representation.dense(torch.arange(rows.start, rows.stop))
+        pieces.append(transfer.squared_norm_of(approximated - values))
     return torch.cat(pieces)
 
 

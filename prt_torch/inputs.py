@@ -13,10 +13,10 @@ from prt_torch.assets import (
     procedural_scene,
 )
 from prt_torch.assets.brdf import brdf
-from prt_torch.assets.material import Material
+from prt_torch.assets.material import Material, split_borders
 from prt_torch.assets.medium import PRESETS
 from prt_torch.baking import check_memory
-from prt_torch.bases import CubeDirections, Haar, LightBasis, SphericalHarmonics
+from prt_torch.bases import SRBF, CubeDirections, Haar, LightBasis, SphericalHarmonics
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
 from prt_torch.settings import LightConfig, PartConfig, RunConfig, SceneConfig
@@ -58,9 +58,13 @@ def load_inputs(config: RunConfig) -> Inputs:
         InputError: If an input is unusable, or the configuration asks for what cannot be.
     """
     mesh, basis = _mesh(config.scene), _light_basis(config)
-    light = config.light
+    materials, light = _materials(config, mesh), config.light
     inputs = Inputs(
-        mesh, _materials(config, mesh), _lights(light.fit, light), _lights(light.test, light), basis
+        split_borders(mesh, materials),
+        materials,
+        _lights(light.fit, light),
+        _lights(light.test, light),
+        basis,
     )
     if config.fit.metric == "light_prior" and not inputs.fit_lights:
         raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
@@ -136,3 +140,7 @@ def _light_basis(config: RunConfig) -> LightBasis:
             return CubeDirections(transfer.light_texels)
         case "haar":
             return Haar(transfer.light_texels, transfer.light_texels // transfer.light_segments)
+        case "srbf":
+            return SRBF(
+                transfer.light_centers, transfer.light_kernel, resolution=transfer.light_texels
+            )

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from prt_torch.bases import Diffuse, ExitBasis, LightBasis, Rowwise
 
+_BLOCK_BYTES = 2**24  # of values that are weighed at once: more need fresh memory each time
+
 
 @runtime_checkable
 class Rows(Protocol):
@@ -196,18 +198,24 @@ class TransferTensor:
         Over the sphere of light directions, averaged over the hemisphere of views, summed over
         channels.
         """
-        return torch.cat([self.squared_norm_of(values) for _, values in self.blocks()])
+        return torch.cat([self.squared_norm_of(values) for _, values in self.blocks(_BLOCK_BYTES)])
 
     def squared_norm_of(
         self, values: Float[Tensor, "points channels rows coeffs"]
     ) -> Float[Tensor, "points"]:
-        """Squared norm in this tensor's light basis of other values, such as a difference."""
-        basis, values = self.surface.light_basis, values.to(torch.float64)
+        """Squared norm in this tensor's light basis of other values, such as a difference.
+
+        Weighed in the type of the values, added up in float64.
+        """
+        basis = self.surface.light_basis
         if self.num_rows > 1:
-            values = self.surface.exit_basis.gram_root().mT.to(values) @ values
-        if basis is None:
-            return values.square().sum((1, 2, 3))
-        return basis.squared_norm(values).sum((1, 2))
+            values = self._row_root.mT.to(values) @ values
+        weighed = values if basis is None else basis.weigh(values)
+        return torch.linalg.vector_norm(weighed, dim=(1, 2, 3), dtype=torch.float64).square()
+
+    @functools.cached_property
+    def _row_root(self) -> Float[Tensor, "rows rows"]:
+        return self.surface.exit_basis.gram_root()
 
 
 def add(terms: Sequence[TransferTensor]) -> TransferTensor:

@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 from contract import relative
+from smooth_light import smooth_light
 
 from prt_torch.assets import concatenate, mesh_from_arrays
 from prt_torch.assets.brdf import GGX, AshikhminShirley, Lambert, Phong, Sum, directional_albedo
-from prt_torch.assets.material import Material, assign_materials
+from prt_torch.assets.material import Material, assign_materials, split_borders
 from prt_torch.assets.medium import PRESETS
 from prt_torch.assets.mesh import Part
 from prt_torch.baking import (
@@ -209,6 +210,37 @@ def test_materials_by_part():
     with pytest.raises(InputError, match="no part 'door'"):
         assign_materials(scene, {"door": shiny})
     assert assign_materials(scene, None)[0] == [Material()]
+
+
+def test_points_on_a_border_are_shaded_for_both_materials():
+    shiny = Material(glossy=PHONG)
+    folded = replace(bumpy(3), parts=(Part("left", 0, 9, 0, 3), Part("right", 0, 9, 3, 5)))
+    split = split_borders(folded, {"right": shiny})
+    index = assign_materials(split, {"right": shiny})[1]
+    left, right = split.faces[:3].reshape(-1), split.faces[3:].reshape(-1)
+    assert not index[left].any()
+    assert index[right].all()
+    shared = set(folded.faces[:3].reshape(-1).tolist()) & set(folded.faces[3:].reshape(-1).tolist())
+    assert split.num_points == folded.num_points + len(shared)
+    assert torch.equal(split.vertices[split.faces], folded.vertices[folded.faces])
+    assert torch.equal(split.normals[split.faces], folded.normals[folded.faces])
+    # Each side shines as it does where all of the mesh is made of its material.
+    common = {"resolution": 8, "supersampling": 1}
+    light = smooth_light((3.0, 2.5, 2.0), 0.1, 6)[0][None].float()
+    eyes = torch.tensor([[0.5, 4.0, 1.0]])
+    mixed = dense_radiance(bake(split, materials={"right": shiny}, **common), light, eyes)
+    alone = dense_radiance(bake(folded, materials=shiny, **common), light, eyes)
+    matt = dense_radiance(bake(folded, **common), light)
+    assert torch.allclose(mixed[:, :, right], alone[:, :, folded.faces[3:].reshape(-1)], atol=2e-5)
+    assert torch.allclose(mixed[:, :, left], matt[:, :, folded.faces[:3].reshape(-1)], atol=2e-5)
+
+
+def test_a_mesh_without_borders_stays_as_it_is():
+    apart = concatenate([bumpy(4, name="lid"), bumpy(5, name="box")], "all")
+    assert split_borders(apart, {"lid": Material(glossy=PHONG)}) is apart
+    folded = replace(bumpy(3), parts=(Part("left", 0, 9, 0, 3), Part("right", 0, 9, 3, 5)))
+    same = {"left": Material(glossy=PHONG), "right": Material(glossy=PHONG)}
+    assert split_borders(folded, same) is folded
 
 
 def test_subsurface_and_gloss_add_up():

@@ -1,7 +1,7 @@
 """What surfaces are made of: a Lambertian part, a glossy part, a translucent inside."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Int
@@ -35,7 +35,8 @@ def assign_materials(
 ) -> tuple[list[Material], Int[Tensor, "points"]]:
     """The materials of a scene, and which of them each point has.
 
-    A point that faces of several parts share takes the material of the part that is listed first.
+    A point that faces of several materials share takes that of the part that is listed first;
+    :func:`split_borders` leaves no such points.
 
     Args:
         mesh: The scene.
@@ -48,6 +49,58 @@ def assign_materials(
     index = torch.zeros(mesh.num_points, dtype=torch.int64)
     if materials is None or isinstance(materials, Material):
         return [materials or Material()], index
+    found, numbers = _number_parts(mesh, materials)
+    for part, number in reversed(list(zip(mesh.parts, numbers, strict=True))):
+        faces = mesh.faces[part.first_face : part.first_face + part.num_faces]
+        index[faces.reshape(-1)] = number
+    return found, index
+
+
+def split_borders(mesh: Mesh, materials: Material | Mapping[str, Material] | None) -> Mesh:
+    """The mesh with a point of its own for each material that meets at a point.
+
+    So a point on a border is shaded for both materials, each seen on its own faces. The first
+    keeps the point; copies for the others follow behind all points.
+
+    Args:
+        mesh: The scene.
+        materials: As for :func:`assign_materials`.
+
+    Raises:
+        InputError: If the mesh has no part of that name.
+
+    Source:
+        Tsai and Shih 2006, section 5.2.1: one group of transfer for each material.
+    """
+    if materials is None or isinstance(materials, Material):
+        return mesh
+    found, numbers = _number_parts(mesh, materials)
+    _, kept = assign_materials(mesh, materials)
+    of_face = torch.zeros(mesh.num_faces, dtype=torch.int64)
+    for part, number in zip(mesh.parts, numbers, strict=True):
+        of_face[part.first_face : part.first_face + part.num_faces] = number
+    corners = mesh.faces.reshape(-1)
+    wanted = of_face.repeat_interleave(3)
+    shared = wanted != kept[corners]
+    copies, which = torch.unique(corners[shared] * len(found) + wanted[shared], return_inverse=True)
+    if len(copies) == 0:
+        return mesh
+    corners = corners.clone()
+    corners[shared] = mesh.num_points + which
+    points = torch.cat([torch.arange(mesh.num_points), copies // len(found)])
+    return replace(
+        mesh,
+        vertices=mesh.vertices[points],
+        faces=corners.view(-1, 3),
+        normals=mesh.normals[points],
+        albedo=mesh.albedo[points],
+    )
+
+
+def _number_parts(
+    mesh: Mesh, materials: Mapping[str, Material]
+) -> tuple[list[Material], list[int]]:
+    """All different materials, the Lambertian one first, and the number of each part's."""
     found, names = [Material()], [part.name for part in mesh.parts]
     numbers: dict[str, int] = {}
     for name, material in materials.items():
@@ -56,7 +109,4 @@ def assign_materials(
         if material not in found:
             found.append(material)
         numbers[name] = found.index(material)
-    for part in reversed(mesh.parts):  # a point that parts share belongs to the first of them
-        faces = mesh.faces[part.first_face : part.first_face + part.num_faces]
-        index[faces.reshape(-1)] = numbers.get(part.name, 0)
-    return found, index
+    return found, [numbers.get(part.name, 0) for part in mesh.parts]

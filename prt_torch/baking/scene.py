@@ -35,11 +35,10 @@ from prt_torch.baking.subsurface import scatter
 from prt_torch.baking.visibility import Progress, VisibilityField, trace_visibility
 from prt_torch.bases import (
     BRDFFactors,
-    CubeDirections,
-    Haar,
     HemisphericalHarmonics,
     LightBasis,
     SphericalHarmonics,
+    TexelBasis,
 )
 from prt_torch.errors import InputError
 from prt_torch.transfer import TransferTensor, add, colour_channels
@@ -71,7 +70,9 @@ def bake(
     Args:
         mesh: The scene.
         materials: One for all points, or some by name of a part of the mesh, the rest being
-            Lambertian with the mesh's albedo; all are if not given.
+            Lambertian with the mesh's albedo; all are if not given. Points that parts of different
+            materials share have one of them unless :func:`~prt_torch.assets.material.split_borders`
+            came before.
         light_basis: What to expand the light in; spherical harmonics of order 6 if not given.
         num_rows: Exit functions of a scene with glossy materials: 24 hemispherical harmonics if
             light is in spherical harmonics, else 10 BRDF factors (12 where Lambertian colours
@@ -108,7 +109,7 @@ def bake(
         )
     if factors is not None and not factored:
         raise ValueError("expected factors only of glossy materials without spherical harmonics")
-    if isinstance(basis, CubeDirections | Haar):
+    if isinstance(basis, TexelBasis):
         check_resolution(basis, resolution * supersampling)
     folder = None if cache is None else Path(cache)
     reflectance = _reflectance(mesh, found, index)

@@ -109,9 +109,9 @@ class LightBasis(ABC):
     def squared_norm(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "..."]:
         """Squared L2 norm over the sphere of the functions with these expansion coefficients.
 
-        In float64.
+        Weighed in the type of the values, added up in float64.
         """
-        return self.weigh(values.to(torch.float64)).square().sum(-1)
+        return torch.linalg.vector_norm(self.weigh(values), dim=-1, dtype=torch.float64).square()
 
 
 class ExitBasis(ABC):
