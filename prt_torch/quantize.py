@@ -106,6 +106,12 @@ def full_scale(
     return step.reshape(()) if dim is None else step
 
 
+def rounded_up(steps: Float[Tensor, "..."], dtype: torch.dtype) -> Float[Tensor, "..."]:
+    """Steps in another type, no smaller than they were, so that what they cover stays covered."""
+    rounded = steps.to(dtype)
+    return torch.where(rounded.double() < steps, rounded.nextafter(rounded + rounded), rounded)
+
+
 def straight_through(
     values: Float[Tensor, "..."], step: Float[Tensor, "..."] | float, bits: int
 ) -> Float[Tensor, "..."]:

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from prt_torch.bases import Diffuse, ExitBasis, LightBasis, Rowwise
+from prt_torch.bases import CubeDirections, Diffuse, ExitBasis, LightBasis, Rowwise
 
 _BLOCK_BYTES = 2**24  # of values that are weighed at once: more need fresh memory each time
 
@@ -216,6 +216,46 @@ class TransferTensor:
     @functools.cached_property
     def _row_root(self) -> Float[Tensor, "rows rows"]:
         return self.surface.exit_basis.gram_root()
+
+
+def project(transfer: TransferTensor, light_basis: LightBasis) -> TransferTensor:
+    """Transfer by texels of a cube map, in another light basis, projected where it is read.
+
+    Args:
+        transfer: By :class:`prt_torch.bases.CubeDirections`.
+        light_basis: The other basis.
+
+    Returns:
+        Values that are the least-squares fit to the texels in the basis, with the squared norms of
+        ``transfer`` as reference where it knows no other.
+
+    Raises:
+        ValueError: If ``transfer`` is not by texels of a cube map.
+    """
+    if not isinstance(transfer.surface.light_basis, CubeDirections):
+        given = transfer.surface.light_basis
+        raise ValueError(f"expected transfer by cube directions, got {given and given.name}")
+    known = transfer.reference_squared_norm
+    return replace(
+        transfer,
+        values=_Projected(transfer.values, transfer.surface.light_basis.resolution, light_basis),
+        surface=replace(transfer.surface, light_basis=light_basis),
+        reference_squared_norm=transfer.squared_norm() if known is None else known,
+        provenance={**transfer.provenance, "projected_from": transfer.surface.light_basis.name},
+    )
+
+
+class _Projected:
+    """Values in a light basis, projected from texels where they are read."""
+
+    def __init__(self, texels: Rows, resolution: int, basis: LightBasis):
+        self._texels, self._resolution, self._basis = texels, resolution, basis
+        self.shape, self.dtype = (*texels.shape[:3], basis.num_coeffs), texels.dtype
+
+    def __getitem__(self, rows: slice, /) -> Tensor:
+        texels = self._texels[rows]
+        values = self._basis.project_cube(texels.flatten(0, 2), self._resolution)
+        return values.view(*texels.shape[:3], -1)
 
 
 def add(terms: Sequence[TransferTensor]) -> TransferTensor:

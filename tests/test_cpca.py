@@ -6,7 +6,7 @@ import torch
 from contract import Contract, random_transfer, relative
 from sklearn.decomposition import PCA
 
-from prt_torch.representations import CPCA, DenseTransfer
+from prt_torch.representations import CPCA
 from prt_torch.representations.cpca_subspaces import principal
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.transfer import TransferTensor
@@ -19,13 +19,6 @@ class TestCPCA(Contract):
     def make_lossless(self, transfer):
         size = transfer.num_channels * transfer.num_rows * transfer.num_coeffs
         return CPCA.from_transfer(transfer, num_clusters=3, rank=size)
-
-
-class TestDense(Contract):
-    def make(self, transfer):
-        return DenseTransfer.from_transfer(transfer)
-
-    make_lossless = make
 
 
 def squared_error(model: CPCA, transfer: TransferTensor) -> float:

@@ -1,15 +1,22 @@
-"""The uncompressed tensor on the contract of every representation: what all others are held to."""
+"""The uncompressed tensor on the contract of every representation: what all others are held to.
 
-from typing import Any, ClassVar
+On request its values are 16-bit codes with a step for each point and row, as Tsai and Shih 2006
+(section 5.1) keep transfer in spherical radial basis functions.
+"""
+
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from prt_torch.metric import Metric
+from prt_torch.quantize import dequantize, full_scale, quantize, rounded_up
 from prt_torch.representations.base import Representation
 from prt_torch.representations.products import matmul_few
 from prt_torch.transfer import Surface, TransferTensor
+
+_BITS = 16
 
 
 class DenseTransfer(Representation):
@@ -18,25 +25,47 @@ class DenseTransfer(Representation):
     Args:
         values: ``"points channels rows coeffs"``.
         surface: Bases, frames and reflectance.
+        steps: ``"points channels rows 1"`` where a file holds 16-bit codes; ``values``
+            are multiples of them.
     """
 
     kind: ClassVar[str] = "dense"
+    steps: Tensor | None
 
-    def __init__(self, values: Tensor, surface: Surface):
+    def __init__(self, values: Tensor, surface: Surface, steps: Tensor | None = None):
         points, channels, rows, coeffs = values.shape
         super().__init__(surface, (points, channels, rows, coeffs))
         self.values = nn.Parameter(values)
+        self.register_buffer("steps", steps)
 
     @classmethod
     def from_transfer(
         cls,
         transfer: TransferTensor,
         *,
+        bits: Literal[16] | None = None,
         metric: Metric | None = None,
         generator: torch.Generator | None = None,
     ) -> "DenseTransfer":
-        """The tensor itself; every metric and seed give the same."""
-        return cls(transfer.dense().clone(), transfer.surface)
+        """The tensor itself; every metric and seed give the same.
+
+        Args:
+            transfer: The tensor.
+            bits: Of a code in a file; None keeps values as they are.
+            metric: Not used: nothing is chosen.
+            generator: Not used: nothing is random.
+
+        Raises:
+            ValueError: If ``bits`` is neither.
+        """
+        if bits not in (_BITS, None):
+            raise ValueError(f"expected {_BITS} bits or None, got {bits!r}")
+        values = transfer.dense().clone()
+        if bits is None:
+            return cls(values, transfer.surface)
+        steps = rounded_up(full_scale(values, bits, dim=-1), values.dtype)
+        coded = dequantize(quantize(values, steps, bits), steps, values.dtype)
+        return cls(coded, transfer.surface, steps)
 
     def forward(
         self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
@@ -62,20 +91,26 @@ class DenseTransfer(Representation):
         return self.values if points is None else self.values[points]
 
     def packed(self) -> dict[str, Tensor]:
-        """The values."""
-        return {"values": self.values.detach().clone()}
+        """The values, or their codes and steps."""
+        if self.steps is None:
+            return {"values": self.values.detach().clone()}
+        return {"codes": quantize(self.values, self.steps, _BITS), "steps": self.steps}
 
     @classmethod
     def from_packed(
         cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
     ) -> "DenseTransfer":
         """The inverse of :meth:`packed`."""
-        return cls(packed["values"].view(shape), surface)
+        if "values" in packed:
+            return cls(packed["values"].view(shape), surface)
+        steps = packed["steps"]
+        values = dequantize(packed["codes"], steps, steps.dtype)
+        return cls(values.view(shape), surface, steps)
 
     @property
     def budget(self) -> dict[str, Any]:
-        """Nothing to choose."""
-        return {}
+        """Bits, where values are coded."""
+        return {} if self.steps is None else {"bits": _BITS}
 
     @property
     def condition(self) -> float:

@@ -32,6 +32,7 @@ from prt_torch.quantize import (
     least_unsigned,
     pack_fields,
     quantize,
+    rounded_up,
     straight_through,
     unpack_fields,
 )
@@ -68,9 +69,7 @@ class Coding:
         bits = _bits(codes, values.shape[-1])
         each = [full_scale(v, b, dim=(0, 2)) for v, b in zip(values.unbind(-1), bits, strict=True)]
         exact = torch.stack(each, dim=-1)[0, :, 0]
-        steps = exact.to(values.dtype)
-        rounded_down = steps.double() < exact
-        return cls(codes, torch.where(rounded_down, steps.nextafter(steps + steps), steps))
+        return cls(codes, rounded_up(exact, values.dtype))
 
 
 def _bits(codes: Codes, channels: int) -> tuple[int, ...]:
