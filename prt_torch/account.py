@@ -14,7 +14,13 @@ from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.report import write_html
-from prt_torch.representations import CPCA, DenseTransfer, Representation, SegmentedCPCA
+from prt_torch.representations import (
+    CPCA,
+    ClusteredTensor,
+    DenseTransfer,
+    Representation,
+    SegmentedCPCA,
+)
 from prt_torch.representations.cpca_relabel import coherence
 from prt_torch.settings import PreviewConfig
 from prt_torch.sphere import rotation_about_up
@@ -99,8 +105,11 @@ def write_report(
         }
         if scaled:
             result["dense_scaled"] = True
-        if isinstance(one.representation, CPCA):
-            result["coherence"] = coherence(one.representation, inputs.mesh.faces)
+        match one.representation:
+            case CPCA() as model:
+                result["coherence"] = coherence(model, inputs.mesh.faces)
+            case ClusteredTensor() as model:
+                result["coherence"] = model.coherence(inputs.mesh.faces)
         report["results"].append(result)
     store.write_json(out / "report.json", report)
     write_html(out / "report.html", report, pictures)

@@ -27,7 +27,9 @@ from prt_torch.metric import Metric
 from prt_torch.report import summary_table
 from prt_torch.representations import (
     CPCA,
+    ClusteredTensor,
     Representation,
+    ScatteredSRBF,
     SegmentedCPCA,
     WaveletTransfer,
     load,
@@ -35,9 +37,11 @@ from prt_torch.representations import (
 )
 from prt_torch.representations.cpca_relabel import reclassified
 from prt_torch.settings import (
+    ClusteredTensorConfig,
     CPCAConfig,
     RepresentationConfig,
     RunConfig,
+    ScatteredSRBFConfig,
     SegmentedCPCAConfig,
     WaveletConfig,
 )
@@ -234,6 +238,13 @@ def _closed_form(
         case SegmentedCPCAConfig():
             budget = config.memory_budget
             return SegmentedCPCA.from_transfer(transfer, memory_budget=budget, **options, **common)
+        case ClusteredTensorConfig():
+            budget = config.memory_budget
+            return ClusteredTensor.from_transfer(
+                transfer, memory_budget=budget, **options, **common
+            )
+        case ScatteredSRBFConfig():
+            return ScatteredSRBF.from_transfer(transfer, **options, **common)
         case WaveletConfig():
             return WaveletTransfer.from_transfer(transfer, **options)
 

@@ -65,7 +65,7 @@ class MaterialConfig(PartConfig):
 class TransferConfig(_Section):
     """What is baked."""
 
-    light_basis: Literal["sh", "cube", "haar"] = "sh"
+    light_basis: Literal["sh", "cube", "haar", "srbf"] = "sh"
     order: int = Field(6, ge=1, le=64, description="bands of spherical harmonics")
     light_resolution: int | None = Field(
         None, ge=1, le=512, description="texels along a light cube's edge; null is resolution"
@@ -73,6 +73,10 @@ class TransferConfig(_Section):
     light_segments: int = Field(
         2, ge=1, le=512, description="Haar segments along a light cube's edge; 1 is whole faces"
     )
+    light_centers: Literal[12, 42, 162, 642, 2562] = Field(
+        642, description="radial basis functions of the light"
+    )
+    light_kernel: Literal["gaussian", "abel_poisson"] = Field("gaussian", description="their shape")
     resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
     supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
     rows: int | None = Field(
@@ -164,6 +168,20 @@ class CPCAConfig(_Section):
         return self
 
 
+class ScatteredSRBFConfig(_Section):
+    """Scattered functions of Tsai and Shih 2006, fitted to transfer."""
+
+    name: Literal["scattered_srbf"] = "scattered_srbf"
+    num_clusters: int = Field(64, ge=1)
+    num_functions: int = Field(32, ge=1, description="of a cluster")
+    resolution: int = Field(16, ge=2, le=64, description="texels that functions are sampled at")
+
+    @property
+    def label(self) -> str:
+        """Name of the result."""
+        return f"{self.name} {self.num_clusters}x{self.num_functions}"
+
+
 class SegmentedCPCAConfig(_Section):
     """Liu et al. 2004."""
 
@@ -177,6 +195,25 @@ class SegmentedCPCAConfig(_Section):
     def label(self) -> str:
         """Name of the result."""
         return f"{self.name} {self.points_per_cluster}x{self.rank}"
+
+
+class ClusteredTensorConfig(_Section):
+    """Tsai and Shih 2006."""
+
+    name: Literal["clustered_tensor"] = "clustered_tensor"
+    num_clusters: int = Field(140, ge=1)
+    ranks: tuple[
+        Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
+    ] = Field((8, 48, 24), description="of rows, light coefficients and points of a cluster")
+    bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
+    tolerance: float = Field(1e-4, ge=0, lt=1, description="gain of a turn that ends a phase")
+    max_turns: int = Field(40, ge=1, description="of each phase")
+
+    @property
+    def label(self) -> str:
+        """Name of the result."""
+        bits = "" if self.bits else " float"
+        return f"{self.name} {self.num_clusters}x{'/'.join(map(str, self.ranks))}{bits}"
 
 
 class WaveletConfig(_Section):
@@ -200,11 +237,14 @@ class WaveletConfig(_Section):
 
 
 RepresentationConfig = Annotated[
-    CPCAConfig | SegmentedCPCAConfig | WaveletConfig, Field(discriminator="name")
+    CPCAConfig | ClusteredTensorConfig | ScatteredSRBFConfig | SegmentedCPCAConfig | WaveletConfig,
+    Field(discriminator="name"),
 ]
 
 KINDS: dict[str, type[_Section]] = {
     "cpca": CPCAConfig,
+    "clustered_tensor": ClusteredTensorConfig,
+    "scattered_srbf": ScatteredSRBFConfig,
     "segmented_cpca": SegmentedCPCAConfig,
     "wavelet": WaveletConfig,
 }

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from prt_torch.bases import CubeDirections, Diffuse, ExitBasis, LightBasis, Rowwise
@@ -54,6 +54,7 @@ class Surface:
         frames: ``"points 3 3"`` shading frames, rows tangent, bitangent, normal; None where views
             do not matter.
         positions: ``"points 3"`` in mesh units; None for a tensor that never was a mesh.
+        materials: ``"points"``: which material each point has; None where all have one.
     """
 
     exit_basis: ExitBasis = field(default_factory=Diffuse)
@@ -63,6 +64,7 @@ class Surface:
     )
     frames: Float[Tensor, "points 3 3"] | None = None
     positions: Float[Tensor, "points 3"] | None = None
+    materials: Int[Tensor, "points"] | None = None
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,11 @@ class TransferTensor:
             raise ValueError(
                 f"expected reflectance of 1 or {self.num_points} points, "
                 f"got {len(self.surface.reflectance)}"
+            )
+        materials = self.surface.materials
+        if materials is not None and len(materials) != self.num_points:
+            raise ValueError(
+                f"expected materials of {self.num_points} points, got {len(materials)}"
             )
 
     @classmethod
@@ -175,6 +182,7 @@ class TransferTensor:
                 reflectance=surface.reflectance if shared else surface.reflectance[rows],
                 frames=None if surface.frames is None else surface.frames[rows],
                 positions=None if surface.positions is None else surface.positions[rows],
+                materials=None if surface.materials is None else surface.materials[rows],
             ),
         )
 
@@ -263,14 +271,15 @@ def add(terms: Sequence[TransferTensor]) -> TransferTensor:
 
     Diffuse terms enter the constant function of a glossy exit basis. Reflectance stays a factor
     where all terms share it; otherwise it is multiplied in, which makes three channels unless it
-    is grey.
+    is grey. Materials are those of the terms that know them.
 
     Args:
         terms: At least one. Their exit bases are diffuse, or one and the same.
 
     Raises:
-        ValueError: If points, light bases or exit bases do not fit together, diffuse terms meet an
-            exit basis that does not hold the constant, or reflectances differ under coloured ones.
+        ValueError: If points, materials, light bases or exit bases do not fit together, diffuse
+            terms meet an exit basis that does not hold the constant, or reflectances differ under
+            coloured ones.
 
     Source:
         Sloan et al. 2003, section 3.1 and figure 9 (subsurface and glossy transfer in one matrix).
@@ -294,9 +303,21 @@ def add(terms: Sequence[TransferTensor]) -> TransferTensor:
     if not shared and surface.exit_basis.num_channels > 1:
         raise ValueError("expected terms of one reflectance, for coloured exit functions")
     values = _SumOfRows(terms, surface.exit_basis, factored=shared)
-    reflectance = first.surface.reflectance if shared else torch.ones(1, 3)
+    surface = replace(
+        surface,
+        reflectance=first.surface.reflectance if shared else torch.ones(1, 3),
+        materials=_shared_materials(terms),
+    )
     provenance = {"terms": [term.provenance for term in terms]}
-    return TransferTensor(values, replace(surface, reflectance=reflectance), None, provenance)
+    return TransferTensor(values, surface, None, provenance)
+
+
+def _shared_materials(terms: Sequence[TransferTensor]) -> Int[Tensor, "points"] | None:
+    """Those of the terms that know them, which must be the same."""
+    known = [own for term in terms if (own := term.surface.materials) is not None]
+    if not all(torch.equal(own, known[0]) for own in known):
+        raise ValueError("expected terms of the same materials, got different ones")
+    return known[0] if known else None
 
 
 class _SumOfRows:

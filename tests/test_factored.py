@@ -10,6 +10,7 @@ import torch
 import trimesh
 from contract import relative
 
+from prt_torch import evaluate
 from prt_torch.assets import concatenate, mesh_from_arrays
 from prt_torch.assets.brdf import GGX, Lambert, Phong, Sum
 from prt_torch.assets.material import Material
@@ -19,6 +20,7 @@ from prt_torch.baking import bake, factored, project_diffuse, trace_visibility
 from prt_torch.baking.factored import FactoredReflection, project_factored
 from prt_torch.baking.visibility import VisibilityField
 from prt_torch.bases import (
+    SRBF,
     BRDFFactors,
     CubeDirections,
     Haar,
@@ -27,6 +29,7 @@ from prt_torch.bases import (
     factor_error,
     haar,
 )
+from prt_torch.bases.srbf import gaussian
 from prt_torch.errors import InputError
 from prt_torch.evaluate import dense_radiance
 from prt_torch.sphere import (
@@ -504,3 +507,34 @@ class TestCache:
         assert again.provenance["factor_error"] == first.provenance["factor_error"]
         views = (t.surface.exit_basis.tensors()["view_values"] for t in (first, again))
         assert torch.equal(*views)
+
+
+def test_norms_are_of_the_texels_whatever_the_basis(coarse):
+    made_of = Material(lambertian=False, glossy=PHONG)
+    texels, wavelets, kernels = (
+        bake(ball(), materials=made_of, light_basis=basis, **RAYS)
+        for basis in (CubeDirections(8), Haar(8, 4), SRBF(42, resolution=8))
+    )
+    full = texels.reference_squared_norm
+    assert full is not None
+    assert kernels.reference_squared_norm is not None
+    assert relative(full, texels.squared_norm()) < 1e-6
+    assert torch.equal(full, wavelets.reference_squared_norm)
+    # What the kernels lose, measured by their sum at the middle of each texel.
+    basis = kernels.surface.light_basis
+    directions = cubemap_directions(32, dtype=torch.float64).reshape(-1, 3)
+    bells = gaussian(directions, basis.centers, basis.bandwidths).float()
+    sums = basis_texels(kernels.dense() @ bells.mT)
+    wrong = float(texels.squared_norm_of(texels.dense() - sums).sum() / full.sum())
+    assert evaluate.reference_error(0.0, kernels) == pytest.approx(wrong, rel=0.1)
+    assert wrong > 1e-3
+
+
+def basis_texels(values: torch.Tensor) -> torch.Tensor:
+    """Integrals over texels of a cube of 8 of values at those of 32."""
+    solid_angles = cubemap_solid_angles(32).flatten()
+    return (
+        CubeDirections(8)
+        .project_cube((values * solid_angles).flatten(0, 2), 32)
+        .view(*values.shape[:3], -1)
+    )

@@ -31,14 +31,14 @@ from prt_torch.assets.brdf import BRDF
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.projection import pieces, project_points
 from prt_torch.baking.visibility import Progress, VisibilityField
-from prt_torch.bases import BRDFFactors, CubeDirections, Haar, HemisphereMap
+from prt_torch.bases import SRBF, BRDFFactors, HemisphereMap, TexelBasis
 from prt_torch.errors import InputError
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles, frame_from_normal
 from prt_torch.transfer import Surface, TransferTensor
 
 _SHARD_BYTES = 2**26
 _POINTS_AT_ONCE = 16
-_ALGORITHM = 2  # raise it when the same inputs would give other values
+_ALGORITHM = 3  # raise it when the same inputs would give other values
 _FACTORING = 2  # likewise of factors
 
 
@@ -87,7 +87,7 @@ def project_factored(
     mesh: Mesh,
     visibility: VisibilityField,
     reflection: FactoredReflection,
-    light_basis: CubeDirections | Haar,
+    light_basis: TexelBasis,
     *,
     reflectance: Float[Tensor, "points_or_one rgb"] | None = None,
     cache: Path | None = None,
@@ -99,7 +99,7 @@ def project_factored(
         mesh: The scene that ``visibility`` was traced for.
         visibility: Its visibility bits.
         reflection: How its points reflect.
-        light_basis: Light by texels, or their wavelets.
+        light_basis: Light by texels, their wavelets, or kernels fitted to them.
         reflectance: Multiplies at the end; ones if not given.
         cache: Folder of bakes; None keeps the values in memory.
         progress: Told of points done and points in all.
@@ -173,11 +173,11 @@ def kept_factors(
     return factors
 
 
-def check_resolution(light_basis: CubeDirections | Haar, resolution: int) -> None:
+def check_resolution(light_basis: TexelBasis, resolution: int) -> None:
     """Check that rays divide the texels of a light evenly.
 
     Args:
-        light_basis: Light by texels, or their wavelets.
+        light_basis: Light by texels, their wavelets, or kernels fitted to them.
         resolution: Sub-texels along an edge of a face of the visibility cube.
 
     Raises:
@@ -194,6 +194,7 @@ def _project_shard(projector: "_Projector", mesh: Mesh, rows: slice) -> dict[str
     basis, num_rows = projector.light_basis, projector.factors.num_rows
     frames = frame_from_normal(mesh.normals).float()
     values = torch.zeros(rows.stop - rows.start, 1, num_rows, basis.num_coeffs)
+    norms = torch.zeros(rows.stop - rows.start, dtype=torch.float64)
     for some in pieces(rows, _POINTS_AT_ONCE):
         by_texel = [
             projector.project(point, seen, frames[point])
@@ -203,8 +204,12 @@ def _project_shard(projector: "_Projector", mesh: Mesh, rows: slice) -> dict[str
         ]
         flat = basis.project_cube(torch.cat(by_texel), basis.resolution)
         of_points = flat.view(len(by_texel), num_rows, basis.num_coeffs)
-        values[some.start - rows.start : some.stop - rows.start, 0] = of_points
-    return {"values": values}
+        here = slice(some.start - rows.start, some.stop - rows.start)
+        values[here, 0] = of_points
+        norms[here] = torch.stack([projector.squared_norm(one) for one in by_texel])
+        if isinstance(basis, SRBF):  # so that the norm less that of the values is what they lose
+            norms[here] += basis.blur(projector.row_root @ of_points).sum(1)
+    return {"values": values, "reference_squared_norm": norms}
 
 
 class _Projector:
@@ -217,7 +222,7 @@ class _Projector:
         self,
         visibility: VisibilityField,
         reflection: FactoredReflection,
-        light_basis: CubeDirections | Haar,
+        light_basis: TexelBasis,
     ):
         self.visibility, self.reflection, self.light_basis = visibility, reflection, light_basis
         self.factors = reflection.factors
@@ -233,6 +238,14 @@ class _Projector:
         self.maps = [maps.mT.contiguous() for maps in padded]
         line = self.factors.hemisphere.resolution + 1
         self.steps = torch.tensor([0, 1, line, line + 1])
+        self.row_root = self.factors.gram_root().mT.float()
+        texels = cubemap_solid_angles(coarse, dtype=torch.float64).flatten()
+        self.over_root = texels.rsqrt().float()
+
+    def squared_norm(self, by_texel: Float[Tensor, "rows texels"]) -> Float[Tensor, ""]:
+        """Over light texels and the hemisphere of views, float64."""
+        weighed = (self.row_root @ by_texel).mul_(self.over_root)
+        return torch.linalg.vector_norm(weighed, dtype=torch.float64).square()
 
     @torch.no_grad()
     def project(

@@ -91,7 +91,8 @@ def bake(
         stages: Told of the progress of each stage.
 
     Returns:
-        Diffuse transfer of one row, or rows of an exit basis where any part is glossy.
+        Diffuse transfer of one row, or rows of an exit basis where any part is glossy. Its surface
+        says which material each point has where there are several, Lambertian ones being one.
 
     Raises:
         InputError: If the cache cannot be written or is damaged, a part is unknown, bounces are
@@ -145,7 +146,10 @@ def bake(
             terms.append(scene.subsurface(material, index == number))
             taken = time.perf_counter() - start
             facts["subsurface_seconds"] = facts.get("subsurface_seconds", 0.0) + taken
-    return replace(add(terms), provenance=facts)
+    total = add(terms)
+    if bool((index != index[:1]).any()):
+        total = replace(total, surface=replace(total.surface, materials=index))
+    return replace(total, provenance=facts)
 
 
 @dataclass(frozen=True)

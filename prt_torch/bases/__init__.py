@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from prt_torch.bases import haar, sh
+from prt_torch.bases import haar, sh, srbf
 from prt_torch.bases.base import ExitBasis, LightBasis, Radiance
 from prt_torch.bases.brdf_error import FactorError, factor_error
 from prt_torch.bases.brdf_factors import BRDFFactors
@@ -14,12 +14,16 @@ from prt_torch.bases.exit import Diffuse, HemisphericalHarmonics, Rowwise
 from prt_torch.bases.haar import Haar
 from prt_torch.bases.hemisphere_map import HemisphereMap
 from prt_torch.bases.sh import SphericalHarmonics
+from prt_torch.bases.srbf import SRBF, SRBFExpansion
+from prt_torch.bases.srbf_fitting import EnvironmentFit, fit_environment
 from prt_torch.errors import InputError
 
 __all__ = [
+    "SRBF",
     "BRDFFactors",
     "CubeDirections",
     "Diffuse",
+    "EnvironmentFit",
     "ExitBasis",
     "FactorError",
     "Haar",
@@ -28,13 +32,20 @@ __all__ = [
     "LightBasis",
     "Radiance",
     "Rowwise",
+    "SRBFExpansion",
     "SphericalHarmonics",
+    "TexelBasis",
     "exit_basis",
     "factor_error",
+    "fit_environment",
     "haar",
     "light_basis",
     "sh",
+    "srbf",
 ]
+
+TexelBasis = CubeDirections | Haar | SRBF
+"""Bases whose transfer comes from the texels of a cube of their own ``resolution``."""
 
 
 def light_basis(description: dict[str, Any]) -> LightBasis:
@@ -46,8 +57,16 @@ def light_basis(description: dict[str, Any]) -> LightBasis:
             return CubeDirections(resolution)
         case {"name": "haar", "resolution": int(resolution), "segment": int(segment)}:
             return Haar(resolution, segment)
+        case {
+            "name": "srbf",
+            "num_centers": int(num_centers),
+            "kernel": str(kernel),
+            "bandwidth": float(bandwidth),
+            "resolution": int(resolution),
+        }:
+            return SRBF(num_centers, kernel, bandwidth, resolution)  # pyright: ignore[reportArgumentType]
         case _:
-            raise InputError(f"light basis: expected sh, cube or haar, got {description}")
+            raise InputError(f"light basis: expected sh, cube, haar or srbf, got {description}")
 
 
 def exit_basis(description: dict[str, Any], tensors: Mapping[str, Tensor]) -> ExitBasis:

@@ -87,8 +87,8 @@ class LightBasis(ABC):
         """Expansion coefficients into the space where sums of squares are squared L2 norms.
 
         Of the functions, over the sphere: ``weigh(v) · weigh(w)`` is their inner product. In the
-        dtype of ``values``, without a matrix of coefficients by coefficients. May return
-        ``values`` itself.
+        dtype of ``values``; a matrix of coefficients by coefficients only where functions overlap.
+        May return ``values`` itself.
         """
 
     @abstractmethod

@@ -182,9 +182,23 @@ class HemisphereMap:
         self, texels: Float[Tensor, "rows texels"], directions: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch rows"]:
         """Bilinear values of several maps; differentiable in texels and directions."""
-        indices, weights = self.taps(directions)
-        mixed = texels.mT[indices] * weights[..., None].to(texels)
-        return mixed.sum(-2)
+        cell, right, lower = self.cells(*to_horizon(directions).unbind(-1))
+        line = self.resolution + 1
+        steps = torch.tensor([0, 1, line, line + 1], device=cell.device)
+        across, beside = right * (1 - lower), right * lower
+        above = 1 - lower - across
+        weights = torch.stack([above, across, lower - beside, beside], -1).to(texels)
+        indices, padded = cell[..., None] + steps, self.pad(texels).mT
+        if torch.is_grad_enabled() and (texels.requires_grad or directions.requires_grad):
+            return (padded[indices] * weights[..., None]).sum(-2)
+        # The same, without writing what it gathers.
+        found = torch.nn.functional.embedding_bag(
+            indices.reshape(-1, 4),
+            padded.detach().contiguous(),
+            mode="sum",
+            per_sample_weights=weights.reshape(-1, 4),
+        )
+        return found.view(*directions.shape[:-1], len(texels))
 
 
 def _safe_sqrt(values: Tensor) -> Tensor:

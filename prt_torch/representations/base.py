@@ -7,7 +7,7 @@ by ``packed``, which is also what its storage counts. ``tests/contract.py`` hold
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from jaxtyping import Float
@@ -126,3 +126,37 @@ class Representation(nn.Module, ABC):
                 f'"batch {self.num_points} {self.num_coeffs} 3", got {tuple(light.shape)}'
             )
         return local
+
+
+class CodedRepresentation(Representation):
+    """A representation whose file holds codes of its parameters.
+
+    Where the module is in training mode, gradients pass straight through the rounding to codes;
+    leaving it (:meth:`train`, ``eval``) rounds the parameters to what a file holds. They are *at
+    rest* from construction, from loading, and from ``eval()`` on, until they are written to.
+
+    A subclass ends its construction by :meth:`_rest`.
+    """
+
+    @abstractmethod
+    def _rounded(self) -> dict[str, Tensor]:
+        """The parameters by name, at what a file would hold."""
+
+    def train(self, mode: bool = True) -> Self:
+        """Enter training; on leaving it, round the parameters to what a file holds."""
+        if not mode and not self._at_rest:
+            with torch.no_grad():
+                for name, values in self._rounded().items():
+                    getattr(self, name).copy_(values)
+            self._rest()
+        return super().train(mode)
+
+    def _rest(self) -> None:
+        """Remember that the parameters are what a file holds."""
+        self._resting = [(one, one._version) for one in self.parameters(recurse=False)]
+
+    @property
+    def _at_rest(self) -> bool:
+        """Whether no parameter has been replaced or written to since."""
+        pairs = zip(self._resting, self.parameters(recurse=False), strict=True)
+        return all(one is then and one._version == version for (then, version), one in pairs)

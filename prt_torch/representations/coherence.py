@@ -220,28 +220,55 @@ def _other_corners(faces: Tensor, num_points: int) -> list[list[tuple[int, int]]
     return around
 
 
-def registers(ranks: Int[Tensor, "clusters"], num_rows: int) -> Int[Tensor, "clusters"]:
+def registers(vectors: Int[Tensor, "clusters"], num_rows: int) -> Int[Tensor, "clusters"]:
     """Registers of four numbers that each cluster's lit representatives take.
 
-    A mean and ``rank`` vectors a cluster. Each is one colour where transfer is diffuse, and
-    ``num_rows`` numbers a colour channel, one channel a pass, where it is glossy. A vector starts
-    at a whole register, so a quarter of the rows is rounded up.
+    Each vector is one colour where transfer is diffuse, and ``num_rows`` numbers a colour channel,
+    one channel a pass, where it is glossy. A vector starts at a whole register, so a quarter of the
+    rows is rounded up.
 
     Args:
-        ranks: Vectors of each cluster beside its mean.
-        num_rows: Rows of transfer; 1 if diffuse.
+        vectors: Of each cluster, its mean included.
+        num_rows: Rows of a lit vector; 1 if diffuse.
 
     Raises:
-        ValueError: If a rank is negative or there are no rows.
+        ValueError: If a cluster has no vector or there are no rows.
 
     Source:
         Sloan et al. 2003, section 6.2.
     """
     if num_rows < 1:
         raise ValueError(f"expected at least 1 row, got {num_rows}")
-    if len(ranks) and int(ranks.min()) < 0:
-        raise ValueError(f"expected ranks of at least 0, got {int(ranks.min())}")
-    return (ranks + 1) * math.ceil(num_rows / 4)
+    if len(vectors) and int(vectors.min()) < 1:
+        raise ValueError(f"expected at least 1 vector a cluster, got {int(vectors.min())}")
+    return vectors * math.ceil(num_rows / 4)
+
+
+def draws(
+    labels: Int[Tensor, "points"],
+    faces: Int[Tensor, "faces 3"],
+    registers_of_cluster: Int[Tensor, "clusters"],
+) -> dict[str, float]:
+    """How often a face is drawn, by clusters and by superclusters of 256 registers.
+
+    Args:
+        labels: Cluster of each point.
+        faces: Points of each face.
+        registers_of_cluster: Registers that each cluster takes, as :func:`registers` gives them.
+
+    Returns:
+        ``overdraw``, the mean over faces; how many ``superclusters`` there are; and
+        ``overdraw_merged``, the mean where these are drawn.
+
+    Source:
+        Sloan et al. 2003, sections 5 and 6.2.
+    """
+    merged = superclusters(labels, faces, registers_of_cluster=registers_of_cluster)
+    return {
+        "overdraw": float(overdraw(labels, faces).double().mean()),
+        "superclusters": len(merged.unique()),
+        "overdraw_merged": float(overdraw(merged[labels], faces).double().mean()),
+    }
 
 
 def superclusters(

@@ -34,6 +34,7 @@ from torch import Tensor
 from prt_torch.representations.cpca_clusters import refill
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
+from prt_torch.representations.orthonormal import orthonormal
 
 NEAREST = 16
 """Clusters a point may move to in one turn."""
@@ -206,7 +207,7 @@ class Subspaces:
         self.centred[~self.blocks.filled] = 0.0
         for _ in range(steps):
             products = self.blocks.matmul(self.centred, vectors)
-            vectors = _orthonormal(self.blocks.transposed_matmul(self.centred, products))
+            vectors = orthonormal(self.blocks.transposed_matmul(self.centred, products))
         self.vectors = vectors
 
     def spread(self) -> Float[Tensor, "slots"]:
@@ -299,13 +300,6 @@ class Subspaces:
         explained = explained.unflatten(2, vectors.shape[2:]).square_().sum(2)
         lengths = shift.square().sum(1)[:, None]
         return torch.baddbmm(lengths, rows, shift, alpha=-2.0).sub_(explained)
-
-
-def _orthonormal(vectors: Float[Tensor, "clusters d rank"]) -> Float[Tensor, "clusters d rank"]:
-    """Orthonormal columns with the same span; zero columns stay harmless unit vectors."""
-    scale = vectors.abs().amax((1, 2), keepdim=True)
-    with one_thread():
-        return torch.linalg.qr(vectors / torch.where(scale > 0, scale, 1.0))[0]
 
 
 def _relocate(

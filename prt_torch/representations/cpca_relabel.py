@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from prt_torch.metric import Metric
-from prt_torch.representations.coherence import overdraw, reclassify, registers, superclusters
+from prt_torch.representations.coherence import draws, reclassify, registers
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.cpca_encoding import Encoding
 from prt_torch.representations.cpca_subspaces import one_thread
@@ -134,13 +134,8 @@ def coherence(model: CPCA, faces: Int[Tensor, "faces 3"]) -> dict[str, float]:
     Source:
         Sloan, Hall, Hart, Snyder 2003, sections 5 and 6.2.
     """
-    needed = registers(model.ranks, model.num_rows)
-    merged = superclusters(model.labels, faces, registers_of_cluster=needed)
-    return {
-        "overdraw": float(overdraw(model.labels, faces).double().mean()),
-        "superclusters": len(merged.unique()),
-        "overdraw_merged": float(overdraw(merged[model.labels], faces).double().mean()),
-    }
+    vectors = (model.ranks + int(model.affine)).clamp_min(1)  # a linear cluster may have none
+    return draws(model.labels, faces, registers(vectors, model.num_rows))
 
 
 def _check_range(name: str, numbers: Tensor, count: int) -> None:

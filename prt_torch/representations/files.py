@@ -11,14 +11,24 @@ from prt_torch import store
 from prt_torch.bases import exit_basis, light_basis
 from prt_torch.errors import InputError
 from prt_torch.representations.base import Representation
+from prt_torch.representations.clustered_tensor import ClusteredTensor
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.dense import DenseTransfer
+from prt_torch.representations.scattered_srbf import ScatteredSRBF
 from prt_torch.representations.segmented_cpca import SegmentedCPCA
 from prt_torch.representations.wavelet import WaveletTransfer
 from prt_torch.transfer import Surface
 
 KINDS: dict[str, type[Representation]] = {
-    kind.kind: kind for kind in (CPCA, DenseTransfer, SegmentedCPCA, WaveletTransfer)
+    kind.kind: kind
+    for kind in (
+        CPCA,
+        ClusteredTensor,
+        DenseTransfer,
+        ScatteredSRBF,
+        SegmentedCPCA,
+        WaveletTransfer,
+    )
 }
 """The closed registry of representations: name in configurations and files, to class."""
 

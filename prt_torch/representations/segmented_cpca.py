@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from prt_torch.metric import Metric
 from prt_torch.quantize import straight_through
-from prt_torch.representations.base import Representation
+from prt_torch.representations.base import CodedRepresentation
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.segmented_coding import pack, unpack
 from prt_torch.representations.segmented_encoding import (
@@ -76,13 +76,11 @@ class SegmentStatistics:
     seconds: float
 
 
-class SegmentedCPCA(Representation):
+class SegmentedCPCA(CodedRepresentation):
     """Clustered subspaces of each segment of the light.
 
-    Parameters are ``representatives`` and ``weights`` of an :class:`Encoding`. Where the module is
-    in training mode, gradients pass straight through their quantisation; leaving it
-    (:meth:`train`, ``eval``) rounds them to what a file holds. They are at rest, and evaluation
-    fastest, from their construction, from loading, and from ``eval()`` on.
+    Parameters are ``representatives`` and ``weights`` of an :class:`Encoding`. Where they are at
+    rest, evaluation is fastest.
 
     Args:
         encoding: Clusters, representatives, weights and their steps.
@@ -184,29 +182,14 @@ class SegmentedCPCA(Representation):
         found.statistics = list(statistics)
         return found
 
-    def train(self, mode: bool = True) -> "SegmentedCPCA":
-        """Enter training; on leaving it, round the parameters to what a file holds."""
-        if not mode and not self._at_rest:
-            with torch.no_grad():
-                rounded = self._encoding().rounded()
-                self.representatives.copy_(rounded.representatives)
-                self.weights.copy_(rounded.weights)
-            self._rest()
-        super().train(mode)
-        return self
+    def _rounded(self) -> dict[str, Tensor]:
+        rounded = self._encoding().rounded()
+        return {"representatives": rounded.representatives, "weights": rounded.weights}
 
     def _rest(self) -> None:
-        """Remember that the parameters are what a file holds, and forget how they were lit."""
-        parameters = (self.representatives, self.weights)
-        self._resting = [(one, one._version) for one in parameters]
+        """As for all coded representations; and forget how the parameters were lit."""
+        super()._rest()
         self._lit_mixture: LitMixture | None = None
-
-    @property
-    def _at_rest(self) -> bool:
-        """Whether no parameter has been replaced or written to since."""
-        now = (self.representatives, self.weights)
-        pairs = zip(self._resting, now, strict=True)
-        return all(one is then and one._version == version for (then, version), one in pairs)
 
     def _encoding(self) -> Encoding:
         return Encoding(

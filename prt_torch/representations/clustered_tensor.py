@@ -1,0 +1,290 @@
+r"""Clustered tensor approximation: transfer as points by view by light, reduced in each mode.
+
+Transfer of a glossy scene is a matrix for each point, rows of the exit basis by coefficients of the
+light. Points are clustered, and each cluster's tensor is reduced in all three modes by its own
+Tucker decomposition; the basis of the view is shared by all clusters of one material:
+
+.. math:: T_p \approx U_{view} \Big( \sum_j w_{p,j}\, V_{c,j} \Big) U_{light,c}^T
+
+Light meets each cluster's light basis once, then its cores; a point costs as many weighted sums of
+small vectors as its rank. The work grows with coeffs x light rank a cluster, not with
+coeffs x rows x rank as for CPCA.
+
+Source:
+    Tsai, Shih 2006, sections 5.2 and 6.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from prt_torch.metric import Metric
+from prt_torch.representations.base import CodedRepresentation
+from prt_torch.representations.clustered_tensor_coding import (
+    BITS,
+    Encoding,
+    Parameters,
+    Steps,
+    pack,
+    unpack,
+)
+from prt_torch.representations.clustered_tensor_encoding import TensorStatistics, encode
+from prt_torch.representations.coherence import draws, registers
+from prt_torch.representations.grouped import ClusterBlocks, sort_labels
+from prt_torch.representations.products import matmul_few
+from prt_torch.transfer import Surface, TransferTensor
+
+
+class ClusteredTensor(CodedRepresentation):
+    """Clusters of points with a Tucker decomposition each.
+
+    Parameters are ``view_basis`` ``"groups channels*rows view"``, ``light_bases``
+    ``"clusters light coeffs"``, ``cores`` ``"clusters rank view light"`` and ``weights``
+    ``"points rank"``. Where transfer has three channels, view mode means channels times rows,
+    channel slowest. Clusters of one material are a *group*, with a view basis of its own; a group
+    of less rank than others has zeros in its place. From the closed form, bases are orthonormal in
+    the metric; they are free afterwards, since mixtures of them with the inverse mixtures beside
+    are the same transfer.
+
+    Args:
+        encoding: Clusters, bases and weights.
+        surface: Bases, frames and reflectance.
+        shape: Points, channels, rows, coeffs.
+
+    Attributes:
+        labels: ``"points"``: cluster of each, clusters numbered from the largest to the smallest.
+        groups: ``"clusters"``: group of each.
+        bits: Of a code; None where parameters are kept as they are.
+        statistics: Where the module comes from :meth:`from_transfer`; else None.
+    """
+
+    kind: ClassVar[str] = "clustered_tensor"
+    labels: Tensor
+    groups: Tensor
+    cores: nn.Parameter
+
+    def __init__(self, encoding: Encoding, surface: Surface, shape: tuple[int, int, int, int]):
+        super().__init__(surface, shape)
+        self.bits: Literal[16] | None = None if encoding.steps is None else BITS
+        self.statistics: TensorStatistics | None = None
+        self._condition = encoding.condition
+        self.blocks = ClusterBlocks(encoding.labels, len(encoding.parameters.cores))
+        self.register_buffer("labels", encoding.labels)
+        self.register_buffer("groups", encoding.groups)
+        for name in Parameters.names():
+            values = getattr(encoding.parameters, name).detach()
+            values = values.clone(memory_format=torch.contiguous_format)
+            self.register_parameter(name, nn.Parameter(values))
+            steps = None if encoding.steps is None else getattr(encoding.steps, name)
+            self.register_buffer(f"_{name}_steps", steps)
+        self._rest()
+
+    @classmethod
+    def from_transfer(
+        cls,
+        transfer: TransferTensor,
+        *,
+        num_clusters: int = 140,
+        ranks: Sequence[int] = (8, 48, 24),
+        bits: Literal[16] | None = 16,
+        tolerance: float = 1e-4,
+        max_turns: int = 40,
+        memory_budget: int = 4 * 2**30,
+        metric: Metric | None = None,
+        generator: torch.Generator | None = None,
+    ) -> "ClusteredTensor":
+        """Cluster the points by the error of their decompositions, and decompose each cluster.
+
+        Points of different materials (``transfer.surface.materials``) share no cluster.
+
+        Args:
+            transfer: The tensor to stand for; read by blocks, two or three times over.
+            num_clusters: At least 1 of each material; fewer are made if there are fewer distinct
+                points. They are shared out to materials by squared norm.
+            ranks: Of rows (times channels), light coefficients and points of a cluster, at least 1
+                each; capped at what there is.
+            bits: Of a code; None keeps parameters as they are, for a lossless budget.
+            tolerance: A turn that lowers the squared error by less than this share of it ends a
+                phase.
+            max_turns: Of each of the two phases.
+            memory_budget: Bytes for the points in their principal axes and what is made of them.
+                Where it is short, fewer light axes are kept than the error asks for, and
+                ``statistics.projection_lost`` says what that costs.
+            metric: What errors are worth; the L2 norm over light directions if not given.
+            generator: Source of randomness; seed 0 if not given.
+
+        Raises:
+            ValueError: If an option is out of range.
+            InputError: If there are fewer clusters than materials.
+
+        Source:
+            Tsai, Shih 2006, section 5.2. Clusters begin as those of linear CPCA where the paper has
+            ELBG's; a point tries the clusters nearest to its own, and all of them at the end; bases
+            start from those of the turn before; all of it works in the principal axes of view and
+            light that matter.
+        """
+        _check(num_clusters, ranks, bits, tolerance, max_turns)
+        rows, coeffs, points = ranks
+        encoding, statistics = encode(
+            transfer,
+            num_clusters=num_clusters,
+            ranks=(rows, coeffs, points),
+            tolerance=tolerance,
+            max_turns=max_turns,
+            memory_budget=memory_budget,
+            metric=metric or Metric.l2(transfer),
+            generator=generator or torch.Generator().manual_seed(0),
+        )
+        encoding = encoding if bits is None else encoding.coded()
+        found = cls(encoding, transfer.surface, tuple(transfer.values.shape))
+        found.statistics = statistics
+        return found
+
+    def _rounded(self) -> dict[str, Tensor]:
+        rounded = self._encoding().rounded().parameters
+        return {name: getattr(rounded, name) for name in Parameters.names()}
+
+    def _encoding(self) -> Encoding:
+        parameters = Parameters(**{name: getattr(self, name) for name in Parameters.names()})
+        steps = None
+        if self.bits is not None:
+            steps = Steps(**{n: getattr(self, f"_{n}_steps") for n in Parameters.names()})
+        return Encoding(self.labels, self.groups, parameters, steps, self._condition)
+
+    def _values(self) -> Parameters:
+        """Parameters as a file would hold them, while gradients refine them."""
+        encoding = self._encoding()
+        rounds = self.training and not self._at_rest
+        return encoding.straight_through() if rounds else encoding.parameters
+
+    @property
+    def num_clusters(self) -> int:
+        """Clusters made."""
+        return len(self.cores)
+
+    def forward(
+        self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
+    ) -> Float[Tensor, "batch points rows rgb"]:
+        """Light each cluster's basis, then its cores, then mix these for each point.
+
+        Raises:
+            ValueError: If shapes do not fit, or ``frames`` are given: transfer by directions of
+                the world is fixed to the rest pose.
+
+        Source:
+            Tsai, Shih 2006, section 6, steps 2 and 3, equation 23.
+        """
+        if frames is not None:
+            raise ValueError(
+                "clustered tensors store transfer in the rest pose and cannot be posed by frames"
+            )
+        if self._check_light(light):
+            return self._forward_local(light)
+        values = self._values()
+        columns = light.permute(1, 2, 0).flatten(1)  # coeffs, rgb * batch
+        lit = matmul_few(values.light_bases.flatten(0, 1), columns)
+        lit = lit.view(self.num_clusters, 1, -1, columns.shape[1])
+        lit = values.cores @ lit  # clusters, rank, view, rgb * batch
+        views = self._views(values, slice(None))
+        rows = self._rows(lit.unflatten(-1, (3, -1)), views)
+        mixed = self.blocks.matmul(self.blocks.to_slots(values.weights), rows.flatten(2))
+        radiance = self.blocks.to_points(mixed).view(self.num_points, self.num_rows, 3, len(light))
+        return radiance.permute(3, 0, 1, 2)
+
+    def _views(
+        self, values: Parameters, clusters: Tensor | slice
+    ) -> Float[Tensor, "some_or_one channels_times_rows view"]:
+        """View basis of each of the clusters; only one where all share it, for larger products."""
+        basis = values.view_basis
+        return basis if len(basis) == 1 else basis[self.groups[clusters]]
+
+    def _rows(
+        self,
+        lit: Float[Tensor, "some *rest view rgb batch"],
+        views: Float[Tensor, "some_or_one channels_times_rows view"],
+    ) -> Float[Tensor, "some *rest rows rgb batch"]:
+        """Out of each one's view basis; of three channels, each colour in its own."""
+        if self.num_channels == 1:
+            return torch.einsum("sra,s...acb->s...rcb", views, lit)
+        by_channel = views.unflatten(1, (3, self.num_rows))
+        return torch.einsum("scra,s...acb->s...rcb", by_channel, lit)
+
+    def _forward_local(self, light: Tensor) -> Float[Tensor, "batch points rows rgb"]:
+        """Each point's own light meets its cluster's light basis, then its own core."""
+        values = self._values()
+        by_point = self.blocks.to_slots(light.permute(1, 3, 0, 2))  # slots rgb batch coeffs
+        lit = self.blocks.matmul(by_point, values.light_bases.mT)
+        core = self._cores_of_slots(self.blocks, self.blocks.to_slots(values.weights), values.cores)
+        lit = torch.einsum("sal,scbl->sacb", core, lit)
+        views = self._views(values, self.blocks.cluster_of_slot)
+        return self.blocks.to_points(self._rows(lit, views)).permute(3, 0, 1, 2)
+
+    @staticmethod
+    def _cores_of_slots(
+        blocks: ClusterBlocks, weights: Float[Tensor, "slots rank"], cores: Tensor
+    ) -> Float[Tensor, "slots view light"]:
+        return blocks.matmul(weights, cores.flatten(2)).unflatten(1, cores.shape[2:])
+
+    def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
+        """Weighted cores of each point between the two bases."""
+        values = self._values()
+        blocks, weights = self.blocks, values.weights
+        cores, light_bases = values.cores, values.light_bases
+        if points is not None:
+            labels, old = sort_labels(self.labels[points], self.num_clusters)
+            blocks, weights = ClusterBlocks(labels, self.num_clusters), weights[points]
+            cores, light_bases = cores[old], light_bases[old]
+        core = self._cores_of_slots(blocks, blocks.to_slots(weights), cores)
+        by_view = blocks.to_points(blocks.matmul(core, light_bases))
+        labels = self.labels if points is None else self.labels[points]
+        by_row = self._views(values, labels).squeeze(0) @ by_view
+        return by_row.unflatten(1, (self.num_channels, self.num_rows))
+
+    def packed(self) -> dict[str, Tensor]:
+        """Codes with their steps, and labels (:func:`clustered_tensor_coding.pack`)."""
+        return pack(self._encoding())
+
+    @classmethod
+    def from_packed(
+        cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
+    ) -> "ClusteredTensor":
+        """The inverse of :meth:`packed`."""
+        return cls(unpack(packed), surface, shape)
+
+    def coherence(self, faces: Int[Tensor, "faces 3"]) -> dict[str, float]:
+        """How often a face is drawn (:func:`prt_torch.representations.coherence.draws`).
+
+        A cluster's lit cores are vectors of as many numbers a colour as its view basis has columns.
+        """
+        vectors = torch.full_like(self.groups, self.cores.shape[1])
+        return draws(self.labels, faces, registers(vectors, self.cores.shape[2]))
+
+    @property
+    def budget(self) -> dict[str, Any]:
+        """Clusters, and ranks of rows, light coefficients and points."""
+        _, rank, view, light = self.cores.shape
+        return {"num_clusters": self.num_clusters, "ranks": [view, light, rank]}
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest kept singular value, of the worst cluster; NaN if loaded."""
+        return self._condition
+
+
+def _check(
+    num_clusters: int, ranks: Sequence[int], bits: int | None, tolerance: float, max_turns: int
+) -> None:
+    """Whether the options of :meth:`ClusteredTensor.from_transfer` are in range."""
+    if num_clusters < 1:
+        raise ValueError(f"expected at least 1 cluster, got {num_clusters}")
+    if len(ranks) != 3 or min(ranks) < 1:
+        raise ValueError(f"expected three ranks of at least 1, got {tuple(ranks)}")
+    if bits not in (BITS, None):
+        raise ValueError(f"expected 16 bits or None, got {bits!r}")
+    if not 0.0 <= tolerance < 1.0:
+        raise ValueError(f"expected a tolerance in 0..1, got {tolerance}")
+    if max_turns < 1:
+        raise ValueError(f"expected at least 1 turn, got {max_turns}")
