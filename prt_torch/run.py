@@ -244,7 +244,9 @@ def _closed_form(
                 transfer, memory_budget=budget, **options, **common
             )
         case ScatteredSRBFConfig():
-            return ScatteredSRBF.from_transfer(transfer, **options, **common)
+            return ScatteredSRBF.from_transfer(
+                transfer, memory_budget=config.memory_budget, **options, **common
+            )
         case WaveletConfig():
             return WaveletTransfer.from_transfer(transfer, **options)
 

@@ -175,11 +175,13 @@ class ScatteredSRBFConfig(_Section):
     num_clusters: int = Field(64, ge=1)
     num_functions: int = Field(32, ge=1, description="of a cluster")
     resolution: int = Field(16, ge=2, le=64, description="texels that functions are sampled at")
+    bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
 
     @property
     def label(self) -> str:
         """Name of the result."""
-        return f"{self.name} {self.num_clusters}x{self.num_functions}"
+        bits = "" if self.bits else " float"
+        return f"{self.name} {self.num_clusters}x{self.num_functions}{bits}"
 
 
 class SegmentedCPCAConfig(_Section):

@@ -1,4 +1,4 @@
-"""Clustered tensors of several materials: a view basis each, shares of clusters, overdraw, bakes."""
+"""Clustered tensors of several materials: view bases, shares of clusters, overdraw, bakes."""
 
 from dataclasses import replace
 
@@ -73,10 +73,11 @@ def test_points_of_one_row_take_one_column_and_zeros():
     materials = transfer.surface.materials
     assert materials is not None
     assert torch.equal(model.groups[model.labels] == 1, materials == 4)
-    assert model.view_basis.shape == (2, 8, 3)  # of 5 asked for, 3 are there
-    assert float(model.view_basis[0, :, 1:].abs().max()) == 0.0
-    assert float(model.view_basis[0, 2, 0].abs()) == pytest.approx(1.0)
-    assert float(model.cores[model.groups == 0][:, :, 1:].abs().max()) == 0.0
+    views, cores = model.view_basis.detach(), model.cores.detach()
+    assert views.shape == (2, 8, 3)  # of 5 asked for, 3 are there
+    assert float(views[0, :, 1:].abs().max()) == 0.0
+    assert float(views[0, 2, 0].abs()) == pytest.approx(1.0)
+    assert float(cores[model.groups == 0][:, :, 1:].abs().max()) == 0.0
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -164,7 +165,6 @@ def test_parts_are_read_by_runs():
     for points, part in parts:
         assert torch.equal(part.dense(), values[points])
         assert torch.equal(part.values[3:9], values[points[3:9]])
-        assert part.values[4:4].shape == (0, 1, 2, 3)
 
 
 class TestMaterialsOfATransfer:

@@ -386,7 +386,7 @@ def test_one_cluster_and_all_different_clusters():
 
 @pytest.mark.parametrize(("num_rows", "clusters"), [(16, 7), (24, 4), (1, 28)])
 def test_clusters_a_supercluster_in_the_paper(num_rows, clusters):
-    """A mean and rank 8 in 256 registers: as many clusters in a row as the formula says, and no more."""
+    """256 registers for a mean and rank 8 each: as many clusters in a row as fit, no more."""
     sizes = registers(torch.full((60,), 9), num_rows)
     assert 256 // int(sizes[0]) == clusters
     labels = torch.arange(60).repeat(2)

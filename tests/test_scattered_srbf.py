@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -22,7 +22,9 @@ from prt_torch.bases.srbf_objective import (
     widths_from_bandwidths,
 )
 from prt_torch.bases.srbf_seeds import coverage_seeds, relocate
-from prt_torch.representations import ScatteredSRBF
+from prt_torch.errors import InputError
+from prt_torch.representations import ScatteredSRBF, scattered_srbf_encoding
+from prt_torch.representations.scattered_srbf_coding import from_octahedron, to_octahedron
 from prt_torch.sphere import (
     cubemap_directions,
     cubemap_index,
@@ -131,7 +133,7 @@ def projected_residual(objective, at, unit, frames) -> torch.Tensor:
 
 def test_side_by_side_is_one_after_the_other():
     basis = CubeDirections(RESOLUTION)
-    names = ("sunset", "area_lights", "sky")
+    names = ("sunset", "area_lights")
     lights = torch.stack([basis.project(find_environment(name)) for name in names])
     together = fit_texels(lights, 10, rounds=2)
     alone = [fit_texels(light[None], 10, rounds=2) for light in lights]
@@ -161,9 +163,9 @@ def test_no_worse_than_l_bfgs_b_from_the_same_seeds():
 
 def test_a_moving_sun_starts_from_the_frame_before():
     sun = find_environment("sunset")
-    before = fit_environment(sun, 16, resolution=RESOLUTION)
+    before = fit_environment(sun, 12, resolution=RESOLUTION)
     turned = sun.rotated(rotation_about_up(4.0))
-    cold = fit_environment(turned, 16, resolution=RESOLUTION)
+    cold = fit_environment(turned, 12, resolution=RESOLUTION)
     warm = fit_environment(turned, start=before.expansion, resolution=RESOLUTION)
     assert warm.steps[0] < cold.steps[0]
     assert warm.squared_error[0] < 1.5 * cold.squared_error[0]
@@ -196,8 +198,7 @@ def test_seeds_spread_and_the_brightest_come_first():
     assert len(torch.unique(many, dim=0)) == len(light)
 
 
-@pytest.mark.parametrize("texel", [0, 27, 36, 200])
-@pytest.mark.parametrize("ratio", [1e3, 1e9])
+@pytest.mark.parametrize(("texel", "ratio"), [(0, 1e9), (27, 1e3), (200, 1e9)])
 def test_a_sun_of_one_texel(texel, ratio):
     light = sun_light(texel, ratio)
     fit = fit_texels(light, 24)
@@ -281,14 +282,161 @@ def in_harmonics(transfer: TransferTensor) -> TransferTensor:
 
 class TestContract(Contract):
     def make(self, transfer):
+        # eval(): rounding has no derivative, so gradients are checked of the values as they are.
         return ScatteredSRBF.from_transfer(
-            in_harmonics(transfer), num_clusters=4, num_functions=3, resolution=6
-        )
+            in_harmonics(transfer), num_clusters=2, num_functions=2, resolution=4
+        ).eval()
 
     def make_lossless(self, transfer):
         return ScatteredSRBF.from_transfer(
-            in_harmonics(transfer), num_clusters=3, num_functions=24, resolution=6
+            in_harmonics(transfer), num_clusters=3, num_functions=24, resolution=6, bits=None
         )
+
+
+def small_model(bits: Literal[16] | None = 16, **options: Any) -> ScatteredSRBF:
+    transfer = in_harmonics(random_transfer(dtype=torch.float32))
+    return ScatteredSRBF.from_transfer(
+        transfer, num_clusters=3, num_functions=4, resolution=4, bits=bits, **options
+    )
+
+
+def test_octahedral_codes_are_near_and_stable_everywhere():
+    """Codes of all edges and corners too, where several stand for one direction."""
+    generator = torch.Generator().manual_seed(0)
+    anywhere = torch.randn(20000, 3, generator=generator, dtype=torch.float64)
+    anywhere = torch.nn.functional.normalize(anywhere, dim=1)
+    decoded = from_octahedron(to_octahedron(anywhere), torch.float64)
+    assert float((decoded - anywhere).norm(dim=1).max()) < 7e-5
+    edge = torch.tensor([-32767, -32766, -20000, -1, 0, 1, 12345, 16384, 32766, 32767])
+    grid = torch.cartesian_prod(edge, edge).to(torch.int16)
+    for dtype in (torch.float32, torch.float64):
+        for codes in (to_octahedron(anywhere), to_octahedron(from_octahedron(grid, dtype))):
+            assert torch.equal(to_octahedron(from_octahedron(codes, dtype)), codes)
+        lengths = from_octahedron(grid, dtype).norm(dim=1)
+        assert torch.allclose(lengths, torch.ones_like(lengths))
+
+
+def test_rounding_to_codes_adds_nearly_nothing():
+    transfer = in_harmonics(random_transfer(points=200, dtype=torch.float32))
+    norms = []
+    for bits in (16, None):
+        model = ScatteredSRBF.from_transfer(
+            transfer, num_clusters=3, num_functions=5, resolution=6, bits=bits
+        )
+        lost = model.dense().detach() - transfer.dense()
+        norms.append(float(transfer.squared_norm_of(lost).sum()))
+    assert norms[0] == pytest.approx(norms[1], rel=1e-3)
+    assert norms[0] > 0
+
+
+def test_a_file_holds_six_bytes_a_function_two_a_weight_and_one_a_label():
+    model = small_model()
+    parts = {name: part.nbytes for name, part in model.packed().items()}
+    functions, weights = 3 * 4, 60 * 4
+    assert parts == {
+        "labels": 60,
+        "resolution": 4,
+        "center_codes": 4 * functions,
+        "bandwidth_codes": 2 * functions,
+        "weight_codes": 2 * weights,
+        "weight_steps": 4 * functions,
+    }
+
+
+def test_leaving_training_rounds_to_what_a_file_holds():
+    model = small_model().train()
+    with torch.no_grad():
+        model.centers.add_(0.01)
+        model.log_bandwidths.sub_(0.0137)
+        model.weights.mul_(0.9)
+    light = torch.randn(2, model.num_coeffs, 3)
+    trained = model(light)
+    model.eval()
+    assert torch.allclose(model(light), trained, rtol=1e-5, atol=1e-5)
+    again = ScatteredSRBF.from_packed(model.packed(), model.surface, model.shape)
+    for ours, theirs in zip(model.parameters(), again.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_functions_are_kept_at_rest_and_made_anew_when_parameters_change():
+    model = small_model().eval()
+    with torch.no_grad():
+        kept = model.functions()
+        assert model.functions() is kept
+        model.log_bandwidths.add_(0.5)
+        changed = model.functions()
+        assert not torch.allclose(changed, kept)
+        model.train()
+        model.eval()
+        assert torch.allclose(model.functions(), changed, rtol=1e-2)
+    assert model.functions().requires_grad
+
+
+def test_weights_are_the_best_ones():
+    """No change of the weights lowers the error: the gradient with respect to them is zero."""
+    transfer = in_harmonics(random_transfer())
+    model = ScatteredSRBF.from_transfer(
+        transfer, num_clusters=3, num_functions=4, resolution=4, bits=None
+    )
+    error = (model.dense() - transfer.dense()).square().sum()
+    (gradient,) = torch.autograd.grad(error, model.weights)
+    assert float(gradient.abs().max()) < 1e-9 * float(transfer.dense().square().sum())
+
+
+def test_points_move_to_the_clusters_that_express_them(monkeypatch):
+    transfer = in_harmonics(random_transfer(points=300, coeffs=25, dtype=torch.float32))
+    errors = []
+    for turns in (0, 4):
+        monkeypatch.setattr(scattered_srbf_encoding, "_MOST_TURNS", turns)
+        model = ScatteredSRBF.from_transfer(transfer, num_clusters=4, num_functions=3, resolution=6)
+        lost = model.dense().detach() - transfer.dense()
+        errors.append(float(transfer.squared_norm_of(lost).sum()))
+    assert errors[1] < 0.99 * errors[0]
+
+
+def test_what_does_not_fit_the_memory_budget_is_refused():
+    with pytest.raises(InputError, match="memory_budget: expected at least"):
+        small_model(memory_budget=10_000)
+    transfer = in_harmonics(random_transfer())
+    options: dict[str, Any] = {"num_clusters": 3, "num_functions": 4, "resolution": 4}
+    errors = []
+    for budget in (200_000, 2**30):
+        model = ScatteredSRBF.from_transfer(transfer, memory_budget=budget, **options)
+        lost = model.dense().detach() - transfer.dense()
+        errors.append(float(transfer.squared_norm_of(lost).sum()))
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
+
+
+def test_transfer_is_read_by_blocks():
+    class Watched:
+        def __init__(self, values: torch.Tensor):
+            self.values, self.shape, self.dtype = values, values.shape, values.dtype
+            self.most = 0
+
+        def __getitem__(self, rows: slice) -> torch.Tensor:
+            self.most = max(self.most, rows.stop - rows.start)
+            return self.values[rows]
+
+    transfer = in_harmonics(random_transfer())
+    watched = Watched(transfer.dense())
+    options: dict[str, Any] = {"num_clusters": 2, "num_functions": 3, "resolution": 4}
+    whole = ScatteredSRBF.from_transfer(transfer, **options)
+    blocks = TransferTensor.blocks
+
+    def small_blocks(self, max_bytes: int = 2**28):
+        return blocks(self, min(max_bytes, 7 * 72))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TransferTensor, "blocks", small_blocks)
+        parts = ScatteredSRBF.from_transfer(replace(transfer, values=watched), **options)
+    assert watched.most == 7
+    # Rounding alone may move a step of the fit, so errors are compared and not values.
+    dense = transfer.dense()
+    errors = [
+        float(transfer.squared_norm_of(model.dense().detach() - dense).sum())
+        for model in (parts, whole)
+    ]
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
 
 
 @pytest.mark.parametrize("basis", [CubeDirections(4), Haar(4, 4), SphericalHarmonics(4)])
@@ -309,9 +457,9 @@ def test_transfer_without_a_light_basis_and_poses_are_refused():
     transfer = random_transfer()
     with pytest.raises(ValueError, match="with a light basis"):
         ScatteredSRBF.from_transfer(transfer)
-    model = ScatteredSRBF.from_transfer(in_harmonics(transfer), num_clusters=2, num_functions=2)
+    model = small_model()
     with pytest.raises(ValueError, match="cannot be posed"):
-        model(torch.zeros(1, 9, 3, dtype=torch.float64), frames=torch.eye(3).expand(60, 3, 3))
+        model(torch.zeros(1, 9, 3), frames=torch.eye(3).expand(60, 3, 3))
 
 
 def test_environments_are_reached_from_the_representation():

@@ -124,8 +124,8 @@ class TexelObjective:
         centers = torch.nn.functional.normalize(centers, dim=-1)
         least = (_LEAST_TEXELS * texel_widths(centers, self.resolution)).log()
         log_widths = torch.maximum(log_widths, least).clamp_max(torch.tensor(_WIDEST).log().item())
-        values = profile(self.directions, centers, log_widths, self.kernel)
-        values = values.mul_(self.root_solid_angles)
+        cosines = self.directions @ centers.mT
+        values = profile(cosines, log_widths, self.kernel) * self.root_solid_angles
         gram = values.mT @ values
         scale = gram.diagonal(dim1=1, dim2=2).rsqrt()
         gram = gram * scale[:, :, None] * scale[:, None]
@@ -141,7 +141,7 @@ class TexelObjective:
 
     def gradient(self, at: Projected) -> Float[Tensor, "batch unknowns"]:
         """Half the gradient by tangent steps of centres (all first, all second) and log widths."""
-        return self._gradient(at, self._steepness(at))
+        return self._derivatives(at)[1]
 
     def normal_equations(
         self, at: Projected
@@ -150,76 +150,26 @@ class TexelObjective:
 
         The products over texels are taken in float32: they only steer.
         """
-        steepness = self._steepness(at)
-        gradient = self._gradient(at, steepness)
-        derivatives = self._derivatives(at, steepness)
-        functions = (at.values * at.scale[:, None]).float()
-        across = (functions.mT @ derivatives).double()
-        projected = _second_moment(derivatives, 3).double()
-        projected -= across.mT @ torch.cholesky_solve(across, at.factor)
+        derivatives, gradient = self._derivatives(at)
+        n = at.centers.shape[1]
+        columns = torch.cat([(at.values * at.scale[:, None]).float(), derivatives], dim=2)
+        products = (columns.mT @ columns).double()
+        along, across = products[:, n:, n:], products[:, :n, n:]
+        projected = along - across.mT @ torch.cholesky_solve(across, at.factor)
         weights = at.coefficients.repeat(1, 3, 1)
         return projected * (weights @ weights.mT), gradient
 
-    def _steepness(self, at: Projected) -> Float[Tensor, "batch texels n"]:
-        """Slope of the weighed functions by the negative of what :func:`profile` calls depth."""
-        if self.kernel == "gaussian":
-            return at.values
-        depth = _negative_depth(self.directions, at.centers, at.log_widths).neg_()
-        return 3.0 * at.values / depth.mul_(2.0).add_(1.0)
-
-    def _gradient(
-        self, at: Projected, steepness: Float[Tensor, "batch texels n"]
-    ) -> Float[Tensor, "batch unknowns"]:
-        """From products of the slopes with the residual by the coordinates of the texels."""
-        coordinates = torch.nn.functional.pad(self.directions, (0, 1), value=1.0)
-        by_texel = (at.residual[..., None] * coordinates[:, None]).flatten(2)
-        moments = (steepness.mT @ by_texel).unflatten(2, (-1, 4))  # batch n rgb 4
-        explained = _by_unknown((moments * at.coefficients[..., None]).sum(2), at)
-        ridged = _by_unknown((steepness * at.values).mT @ coordinates, at)
-        squares = at.coefficients.repeat(1, 3, 1).square().sum(-1)
-        return RIDGE * ridged * squares - explained
-
-    def _derivatives(
-        self, at: Projected, steepness: Float[Tensor, "batch texels n"]
-    ) -> Float[Tensor, "batch texels unknowns"]:
-        """Of the weighed functions at texels, float32."""
-        steep, directions = steepness.float(), self.directions.float()
-        inverse = (-2.0 * at.log_widths).exp()[..., None]
-        frames = (frame_from_normal(at.centers)[:, :, :2] * inverse[..., None]).float()
-        batch, texels, n = steep.shape
-        derivatives = steep.new_empty(batch, texels, 3, n)
-        for axis in range(2):
-            slopes = directions @ frames[:, :, axis].mT
-            torch.mul(slopes, steep, out=derivatives[:, :, axis])
-        # In float64: small depths are differences of large numbers.
-        depth = _negative_depth(self.directions, at.centers, at.log_widths).mul_(-2.0).float()
-        torch.mul(depth, steep, out=derivatives[:, :, 2])
-        return derivatives.flatten(2)
-
-
-def _by_unknown(
-    moments: Float[Tensor, "batch n 4"], at: Projected
-) -> Float[Tensor, "batch unknowns"]:
-    """Sums of slopes times x, y, z and 1 of the texels, as sums of derivatives."""
-    inverse = (-2.0 * at.log_widths).exp()
-    frames = frame_from_normal(at.centers)
-    along = (frames[:, :, :2] @ moments[..., :3, None])[..., 0]
-    depth = moments[..., 3] - (at.centers * moments[..., :3]).sum(-1)
-    parts = torch.stack([along[..., 0], along[..., 1], 2.0 * depth], dim=1)
-    return (parts * inverse[:, None]).flatten(1)
-
-
-def _second_moment(
-    columns: Float[Tensor, "batch rows size"], parts: int
-) -> Float[Tensor, "batch size size"]:
-    """``columns.mT @ columns``, by blocks of its upper half."""
-    width = columns.shape[2] // parts
-    moment = columns.new_empty(len(columns), columns.shape[2], columns.shape[2])
-    for first in range(0, columns.shape[2], width):
-        own = slice(first, first + width)
-        moment[:, own, first:] = columns[:, :, own].mT @ columns[:, :, first:]
-        moment[:, first:, own] = moment[:, own, first:].mT.clone()
-    return moment
+    def _derivatives(self, at: Projected) -> tuple[Tensor, Tensor]:
+        """Of the functions at texels, float32, and half the gradient of the objective."""
+        frames = frame_from_normal(at.centers)
+        cosines = self.directions @ at.centers.mT
+        by_cosine, by_width = slopes(cosines, at.log_widths, at.values, self.kernel)
+        along = [by_cosine * (self.directions @ frames[:, :, axis].mT) for axis in range(2)]
+        derivatives = torch.cat([*along, by_width], dim=2)
+        weights = at.coefficients.repeat(1, 3, 1)
+        own = (derivatives * at.values.repeat(1, 1, 3)).sum(1)
+        gradient = -((derivatives.mT @ at.residual) * weights).sum(-1)
+        return derivatives.float(), gradient + RIDGE * own * weights.square().sum(-1)
 
 
 def texel_widths(directions: Float[Tensor, "*batch 3"], resolution: int) -> Float[Tensor, "*batch"]:
@@ -254,27 +204,24 @@ def widths_from_bandwidths(
 
 
 def profile(
-    directions: Float[Tensor, "texels 3"],
-    centers: Float[Tensor, "batch n 3"],
-    log_widths: Float[Tensor, "batch n"],
-    kernel: KernelName,
+    cosines: Float[Tensor, "batch texels n"], log_widths: Float[Tensor, "batch n"], kernel: str
 ) -> Float[Tensor, "batch texels n"]:
-    r"""Kernels scaled to peak 1, as functions of the depth t = (1 - u) / w² of the cosine u.
+    r"""Kernels scaled to peak 1, as functions of the cosine u and the width w.
 
-    :math:`e^{-t}`, and :math:`(1 + 2t)^{-3/2}` of Abel and Poisson.
+    :math:`e^{-(1-u)/w^2}`, and :math:`(1 + 2(1-u)/w^2)^{-3/2}` of Abel and Poisson.
     """
-    negative = _negative_depth(directions, centers, log_widths)
-    if kernel == "gaussian":
-        return negative.exp_()
-    return negative.mul_(-2.0).add_(1.0).pow_(-1.5)
+    depth = (1.0 - cosines) * (-2.0 * log_widths).exp()[:, None]
+    return torch.exp(-depth) if kernel == "gaussian" else (1.0 + 2.0 * depth).pow(-1.5)
 
 
-def _negative_depth(
-    directions: Float[Tensor, "texels 3"],
-    centers: Float[Tensor, "batch n 3"],
+def slopes(
+    cosines: Float[Tensor, "batch texels n"],
     log_widths: Float[Tensor, "batch n"],
-) -> Float[Tensor, "batch texels n"]:
-    """The cosine less one, over the squared width: one product and no further pass."""
-    inverse = (-2.0 * log_widths).exp()
-    alike = directions.expand(len(centers), -1, -1)
-    return torch.baddbmm(-inverse[:, None], alike, (centers * inverse[..., None]).mT)
+    values: Float[Tensor, "batch texels n"],
+    kernel: KernelName,
+) -> tuple[Float[Tensor, "batch texels n"], Float[Tensor, "batch texels n"]]:
+    """Derivatives of :func:`profile`, weighed as ``values``, by the cosine and the log width."""
+    inverse = (-2.0 * log_widths).exp()[:, None]
+    depth = (1.0 - cosines) * inverse
+    steepness = values if kernel == "gaussian" else 3.0 * values / (1.0 + 2.0 * depth)
+    return steepness * inverse, 2.0 * steepness * depth

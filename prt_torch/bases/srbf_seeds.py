@@ -115,20 +115,16 @@ def _best_places(
     objective: TexelObjective, residual: Float[Tensor, "texels rgb"], count: int
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count"]]:
     """Texels and log widths whose functions explain most of a residual, apart from one another."""
-    # In float32, of a residual of a size whose squares it holds: this is a choice, not a result.
-    residual = (residual / residual.abs().max().clamp_min(torch.finfo().tiny)).float()
-    directions = objective.directions.float()
-    root_solid_angles = objective.root_solid_angles.float()
     energy = residual.square().sum(1)
     places: Int[Tensor, "k"] = energy.topk(min(len(energy), max(_CANDIDATES, count))).indices
-    centers = directions[places]
+    centers = objective.directions[places]
+    cosines = centers @ objective.directions.mT
     gains, widths = [], []
     for factor in _TRIED_WIDTHS:
         log_widths = (factor * texel_widths(centers, objective.resolution)).log()
-        values = profile(directions, centers[None], log_widths[None], objective.kernel)[0]
-        values = values.mul_(root_solid_angles)
-        norms = torch.linalg.vector_norm(values, dim=0)
-        gains.append((values.mT @ residual).square().sum(1) / norms.square())
+        values = profile(cosines.mT[None], log_widths[None], objective.kernel)[0]
+        values = values * objective.root_solid_angles
+        gains.append((values.mT @ residual).square().sum(1) / values.square().sum(0))
         widths.append(log_widths)
     gain, which = torch.stack(gains).max(dim=0)
     width = torch.stack(widths).gather(0, which[None])[0]
@@ -140,4 +136,4 @@ def _best_places(
         near = (centers @ centers[best]).clamp(-1.0, 1.0).acos() < _APART * width[best].exp()
         marked = marked | near
     picked = torch.stack(chosen)
-    return objective.directions[places[picked]], width[picked].double()
+    return centers[picked], width[picked]

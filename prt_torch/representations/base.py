@@ -7,7 +7,7 @@ by ``packed``, which is also what its storage counts. ``tests/contract.py`` hold
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -142,14 +142,15 @@ class CodedRepresentation(Representation):
     def _rounded(self) -> dict[str, Tensor]:
         """The parameters by name, at what a file would hold."""
 
-    def train(self, mode: bool = True) -> Self:
+    def train(self, mode: bool = True) -> "CodedRepresentation":
         """Enter training; on leaving it, round the parameters to what a file holds."""
         if not mode and not self._at_rest:
             with torch.no_grad():
                 for name, values in self._rounded().items():
                     getattr(self, name).copy_(values)
             self._rest()
-        return super().train(mode)
+        super().train(mode)
+        return self
 
     def _rest(self) -> None:
         """Remember that the parameters are what a file holds."""

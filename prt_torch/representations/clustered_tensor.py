@@ -64,7 +64,10 @@ class ClusteredTensor(CodedRepresentation):
     kind: ClassVar[str] = "clustered_tensor"
     labels: Tensor
     groups: Tensor
+    view_basis: nn.Parameter
+    light_bases: nn.Parameter
     cores: nn.Parameter
+    weights: nn.Parameter
 
     def __init__(self, encoding: Encoding, surface: Surface, shape: tuple[int, int, int, int]):
         super().__init__(surface, shape)

@@ -27,7 +27,7 @@ from prt_torch.representations.grouped import sort_labels
 from prt_torch.transfer import Rows, Surface, TransferTensor
 
 
-def split(transfer: TransferTensor) -> list[tuple[Int[Tensor, "some"], TransferTensor]]:
+def split(transfer: TransferTensor) -> list[tuple[Int[Tensor, "_"], TransferTensor]]:
     """The points of each material that occurs, and their transfer, read where it is asked for."""
     every = torch.arange(transfer.num_points)
     materials = transfer.surface.materials
@@ -75,7 +75,7 @@ def share_out(num_clusters: int, squared_norms: Sequence[float], sizes: Sequence
     return counts
 
 
-def join(parts: Sequence[tuple[Int[Tensor, "some"], Encoding]]) -> Encoding:
+def join(parts: Sequence[tuple[Int[Tensor, "_"], Encoding]]) -> Encoding:
     """One encoding of all points from those of the groups, in which nothing is rounded yet.
 
     Args:

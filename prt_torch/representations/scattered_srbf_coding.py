@@ -1,7 +1,7 @@
 """Scattered functions and weights as integer codes: what a file holds.
 
 A centre is two codes of 16 bits on the octahedral map, which spreads them evenly over the sphere
-(4e-5 rad at most lie between a direction and its code); a bandwidth is one code of its logarithm,
+(7e-5 rad at most lie between a direction and its code); a bandwidth is one code of its logarithm,
 so that it keeps as many digits whether wide or narrow. Weights have a step for each function of a
 cluster, so that functions of little use keep their digits beside strong ones.
 

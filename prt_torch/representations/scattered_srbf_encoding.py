@@ -4,15 +4,20 @@
    (:mod:`prt_torch.representations.clustered_tensor_projection`); points are clustered there.
 2. A few principal vectors of each cluster, by their size, become functions of direction at texels,
    and the cluster's functions are fitted to them side by side, as colours of one light.
-3. Functions are rounded to what a file holds; then weights are the least-squares ones, of the
+3. Each point moves to that of the nearest clusters whose functions express it best, and functions
+   are fitted again from where they were, as long as the error falls. Measured on a diffuse scene
+   at 6x16x16 texels, 16 and 64 clusters of 16 functions: the error falls by 17 and 13 % for 4 and
+   6 s more beside 9 and 15 s.
+4. Functions are rounded to what a file holds; then weights are the least-squares ones, of the
    transfer itself, so that they make up for the rounding.
 
 Source:
     Tsai, Shih 2006, section 5.3 for step 2; the rest is ours.
 """
 
+import math
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -21,7 +26,11 @@ from torch import Tensor, nn
 from prt_torch.bases import LightBasis
 from prt_torch.bases.srbf_fitting import Descent, seeds
 from prt_torch.bases.srbf_kernels import gaussian
-from prt_torch.bases.srbf_objective import TexelObjective, bandwidths_from_widths
+from prt_torch.bases.srbf_objective import (
+    TexelObjective,
+    bandwidths_from_widths,
+    widths_from_bandwidths,
+)
 from prt_torch.errors import InputError
 from prt_torch.metric import Metric
 from prt_torch.representations.clustered_tensor_projection import (
@@ -29,7 +38,7 @@ from prt_torch.representations.clustered_tensor_projection import (
     project,
     read_moments,
 )
-from prt_torch.representations.cpca_clusters import vector_quantise
+from prt_torch.representations.cpca_clusters import cluster_means, refill, vector_quantise
 from prt_torch.representations.cpca_subspaces import one_thread, principal
 from prt_torch.representations.grouped import sort_labels
 from prt_torch.representations.scattered_srbf_coding import (
@@ -41,8 +50,11 @@ from prt_torch.sphere import cubemap_directions, cubemap_solid_angles
 from prt_torch.transfer import TransferTensor
 
 _SUBSPACE = 8  # vectors of a cluster's transfer that its functions are fitted to
-_PROJECTION_LOSS = 1e-4  # of the energy, that each mode may lose to the projection
+_PROJECTION_LOSS = 1e-3  # of the energy, that each mode may lose to the projection
 _ROUNDS, _ROUND_STEPS, _LAST_STEPS, _TOLERANCE = 3, 3, 8, 1e-3
+_NEAREST = 8  # clusters that a point may move to, its own among them
+_MOST_TURNS, _TURN_GAIN, _TURN_STEPS = 4, 0.01, 4
+_POINTS = 2**12  # at once
 _MOVED = 0.25  # share of functions that a relocation moves
 _RELATIVE_CUTOFF = 1e-7  # of singular values, in the solve for weights
 _CLUSTERS_AT_ONCE = 16
@@ -82,18 +94,21 @@ def encode(
         memory_budget=memory_budget,
     )
     labels, made = vector_quantise(found.points.flatten(1), num_clusters, generator, rough=False)
-    labels, _ = sort_labels(labels, made)
-    subspaces = _subspaces(found, labels, made, metric, basis, resolution, memory_budget)
+    fitting = _Fitting(found, metric, basis, resolution, clusters_at_once, memory_budget)
     # Threads that wait for one another cost more than a small fit.
-    small = subspaces.shape[1] * num_functions < _SMALL
+    small = 6 * resolution**2 * num_functions < _SMALL
     with one_thread() if small else nullcontext():
-        fitted = [_fit(some, num_functions) for some in subspaces.split(clusters_at_once)]
+        labels, functions = _fitted(fitting, labels, made, num_functions)
+    labels, old = sort_labels(labels, made)
     dtype = torch.promote_types(transfer.values.dtype, torch.float32)
-    centers, log_bandwidths = (torch.cat(parts).to(dtype) for parts in zip(*fitted, strict=True))
+    centers, log_bandwidths = (
+        functions.centers[old].to(dtype),
+        functions.log_bandwidths[old].to(dtype),
+    )
     if coded:
         centers, log_bandwidths = rounded_functions(centers, log_bandwidths)
-    functions = in_light_basis(basis, centers.double(), log_bandwidths.double(), resolution)
-    weights, condition = _solve(functions, transfer, labels, metric, dtype)
+    expanded = in_light_basis(basis, centers.double(), log_bandwidths.double(), resolution)
+    weights, condition = _solve(expanded, transfer, labels, metric, dtype)
     parameters = Parameters(centers, log_bandwidths, weights)
     encoding = ScatteredEncoding(labels, parameters, None, resolution, condition)
     return encoding.coded() if coded else encoding
@@ -142,26 +157,107 @@ def in_light_basis(
     return torch.cat(pieces).unflatten(0, centers.shape[:2])
 
 
-def _subspaces(
-    found: Projection,
-    labels: Int[Tensor, "points"],
-    num_clusters: int,
-    metric: Metric,
-    basis: LightBasis,
-    resolution: int,
-    memory_budget: int,
-) -> Float[Tensor, "clusters texels vectors"]:
-    """Functions of direction that span most of each cluster's transfer, by their size."""
-    vectors = []
-    for cluster in range(num_clusters):
-        rows = found.points[labels == cluster].flatten(0, 1).double()
-        singular, directions = principal(rows[None], min(_SUBSPACE, rows.shape[1]))
-        vectors.append(singular[0, :, None] * directions[0])
-    weighed = torch.stack(vectors) @ found.light_axes.mT
-    of_light = _of_light(metric)
-    coefficients = of_light.unweigh(weighed)
-    at_texels = _at_texels(coefficients.flatten(0, 1), basis, resolution, memory_budget)
-    return at_texels.unflatten(0, weighed.shape[:2]).mT
+@dataclass(frozen=True)
+class _Functions:
+    """Of every cluster, float64."""
+
+    centers: Float[Tensor, "clusters n 3"]
+    log_bandwidths: Float[Tensor, "clusters n"]
+
+
+@dataclass(frozen=True)
+class _Fitting:
+    """What fits of functions to points in their axes need."""
+
+    found: Projection
+    metric: Metric
+    basis: LightBasis
+    resolution: int
+    clusters_at_once: int
+    memory_budget: int
+
+    def fit(
+        self, labels: Int[Tensor, "points"], num_clusters: int, start: int | _Functions
+    ) -> _Functions:
+        """Functions of each cluster: so many, or from where they were."""
+        subspaces = self._subspaces(labels, num_clusters).split(self.clusters_at_once)
+        if isinstance(start, int):
+            fitted = [_fit(some, start) for some in subspaces]
+        else:
+            centers = start.centers.split(self.clusters_at_once)
+            logarithms = start.log_bandwidths.split(self.clusters_at_once)
+            places = zip(subspaces, centers, logarithms, strict=True)
+            fitted = [_continued(*place) for place in places]
+        centers, log_bandwidths = zip(*fitted, strict=True)
+        return _Functions(torch.cat(centers), torch.cat(log_bandwidths))
+
+    def _subspaces(
+        self, labels: Int[Tensor, "points"], num_clusters: int
+    ) -> Float[Tensor, "clusters texels vectors"]:
+        """Functions of direction that span most of each cluster's transfer, by their size."""
+        vectors = []
+        for cluster in range(num_clusters):
+            rows = self.found.points[labels == cluster].flatten(0, 1).double()
+            singular, directions = principal(rows[None], min(_SUBSPACE, rows.shape[1]))
+            vectors.append(singular[0, :, None] * directions[0])
+        weighed = torch.stack(vectors) @ self.found.light_axes.mT
+        values = _of_light(self.metric).unweigh(weighed).flatten(0, 1)
+        at_texels = _at_texels(values, self.basis, self.resolution, self.memory_budget)
+        return at_texels.unflatten(0, weighed.shape[:2]).mT
+
+    def held(
+        self, functions: _Functions, near: Int[Tensor, "points candidates"]
+    ) -> Float[Tensor, "points candidates"]:
+        """Squared norm of what clusters' functions can hold of each point."""
+        centers, log_bandwidths = functions.centers, functions.log_bandwidths
+        expanded = in_light_basis(self.basis, centers, log_bandwidths, self.resolution)
+        with one_thread():
+            spans = torch.linalg.qr(_of_light(self.metric).weigh(expanded).mT)[0]
+        spans = (self.found.light_axes.mT @ spans).to(self.found.points)
+        held = torch.zeros(near.shape, dtype=torch.float64, device=near.device)
+        for cluster, span in enumerate(spans):
+            points, places = torch.nonzero(near == cluster, as_tuple=True)
+            for some, own in zip(points.split(_POINTS), places.split(_POINTS), strict=True):
+                products = self.found.points[some] @ span
+                held[some, own] = products.square().sum((1, 2), dtype=torch.float64)
+        return held
+
+
+def _fitted(
+    fitting: _Fitting, labels: Int[Tensor, "points"], num_clusters: int, num_functions: int
+) -> tuple[Int[Tensor, "points"], _Functions]:
+    """Fits and moves of points in turn; the clusters and functions of least error."""
+    points = fitting.found.points.flatten(1)
+    functions = fitting.fit(labels, num_clusters, num_functions)
+    best, least = (labels, functions), math.inf
+    norm = float(torch.linalg.vector_norm(points, dtype=torch.float64).square())
+    for turn in range(_MOST_TURNS + 1):
+        near = _nearest(points, labels, num_clusters)
+        held = fitting.held(functions, near)
+        error = norm - float(held[:, 0].sum())
+        settled = error > (1.0 - _TURN_GAIN) * least
+        if error < least:
+            best, least = (labels, functions), error
+        # Where the error is rounding alone, there is nothing to win.
+        exact = error <= torch.finfo(points.dtype).eps * norm
+        if num_clusters == 1 or settled or exact or turn == _MOST_TURNS:
+            break
+        labels = near.gather(1, held.argmax(1, keepdim=True))[:, 0]
+        labels = refill(labels, points.square().sum(1) - held.amax(1), num_clusters)
+        functions = fitting.fit(labels, num_clusters, functions)
+    return best
+
+
+def _nearest(
+    points: Float[Tensor, "points d"], labels: Int[Tensor, "points"], num_clusters: int
+) -> Int[Tensor, "points candidates"]:
+    """Each point's own cluster, then those whose means are nearest."""
+    means = cluster_means(points, labels, num_clusters)
+    nearest = []
+    for some, own in zip(points.split(_POINTS), labels.split(_POINTS), strict=True):
+        distances = torch.cdist(some, means).scatter_(1, own[:, None], -1.0)
+        nearest.append(distances.topk(min(_NEAREST, num_clusters), largest=False).indices)
+    return torch.cat(nearest)
 
 
 def _at_texels(
@@ -197,6 +293,16 @@ def _fit(subspaces: Tensor, num_functions: int) -> tuple[Tensor, Tensor]:
         descent.run(_ROUND_STEPS, _TOLERANCE)
         descent.move(max(1, int(_MOVED * num_functions)))
     descent.run(_LAST_STEPS, _TOLERANCE)
+    best = descent.best
+    return best.centers, bandwidths_from_widths(best.log_widths.exp(), "gaussian").log()
+
+
+def _continued(subspaces: Tensor, centers: Tensor, log_bandwidths: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`_fit`, a few steps from where functions were."""
+    objective = TexelObjective(subspaces, "gaussian")
+    widths = widths_from_bandwidths(log_bandwidths.exp(), "gaussian")
+    descent = Descent(objective, centers, widths.log())
+    descent.run(_TURN_STEPS, _TOLERANCE)
     best = descent.best
     return best.centers, bandwidths_from_widths(best.log_widths.exp(), "gaussian").log()
 
