@@ -36,6 +36,7 @@ bench: $(INSTALLED)
 	$(BIN)/python eval/benchmark.py
 	$(BIN)/python eval/liu2004.py --supersampling=2
 	$(BIN)/python eval/wang2004.py
+	$(BIN)/python eval/tsai2006.py --supersampling=2
 
 clean:
 	rm -rf $(VENV) .cache runs

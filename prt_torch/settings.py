@@ -206,7 +206,7 @@ class ClusteredTensorConfig(_Section):
     num_clusters: int = Field(140, ge=1)
     ranks: tuple[
         Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
-    ] = Field((8, 48, 24), description="of rows, light coefficients and points of a cluster")
+    ] = Field((16, 48, 24), description="of rows, light coefficients and points of a cluster")
     bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
     tolerance: float = Field(1e-4, ge=0, lt=1, description="gain of a turn that ends a phase")
     max_turns: int = Field(40, ge=1, description="of each phase")

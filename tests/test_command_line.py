@@ -457,6 +457,32 @@ class TestWholeRun:
         assert any("segment" in entry["what"] for entry in first["left_out"])
         check_manifest(Path("out"))
 
+    def test_radial_basis_functions(self):
+        """Clustered tensors and scattered functions of one glossy bake of two materials."""
+        write("ball.obj", obj())
+        chosen = (
+            "scene.ground=true",
+            "scene.ground_resolution=4",
+            "transfer=srbf",
+            "transfer.light_centers=42",
+            "transfer.rows=4",
+            "material.glossy={name: ggx, f0: 0.5, roughness: 0.4}",
+            "representation=clustered_tensor",
+            "representations=[{name: clustered_tensor, num_clusters: 4, ranks: [4, 12, 8]},"
+            " {name: scattered_srbf, num_clusters: 2, num_functions: 8, resolution: 4}]",
+        )
+        dropped = ("representation.", "scene.ground")
+        kept = [one for one in TINY if not one.startswith(dropped)]
+        for _ in range(2):
+            assert MAINS[FIT](["scene.mesh=ball.obj", "out=out", *kept, *chosen]) == 0
+        report = json.loads(Path("out/report.json").read_text())
+        tensors, scattered = report["results"]
+        assert report["light"] == {"basis": "SRBF 42 gaussian", "coeffs": 42}
+        assert 0 < tensors["transfer_error"] < scattered["transfer_error"] < 0.3
+        assert tensors["transfer_error"] < tensors["reference_error"] < 0.3
+        assert tensors["coherence"]["overdraw"] >= 1
+        check_manifest(Path("out"))
+
     def test_bake_then_fit(self, capfd):
         write("my ball = round.obj", obj())
         mesh = "'my ball = round.obj'"
