@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from prt_torch.bases import haar, sh, srbf
+from prt_torch.bases import haar, sh, sh_zxzxz, srbf, zonal
 from prt_torch.bases.base import ExitBasis, LightBasis, Radiance
 from prt_torch.bases.brdf_error import FactorError, factor_error
 from prt_torch.bases.brdf_factors import BRDFFactors
@@ -41,7 +41,9 @@ __all__ = [
     "haar",
     "light_basis",
     "sh",
+    "sh_zxzxz",
     "srbf",
+    "zonal",
 ]
 
 TexelBasis = CubeDirections | Haar | SRBF

@@ -77,6 +77,19 @@ def evaluate(directions: Float[Tensor, "*batch 3"], order: int) -> Float[Tensor,
     return torch.stack(functions, dim=-1)
 
 
+def order_of(coefficients: Float[Tensor, "*batch coeffs"]) -> int:
+    """Number of bands that coefficients have.
+
+    Raises:
+        ValueError: If their number is not a square.
+    """
+    count = coefficients.shape[-1]
+    order = math.isqrt(count)
+    if order < 1 or order * order != count:
+        raise ValueError(f"expected a square number of coefficients, got {count}")
+    return order
+
+
 def _legendre_step(band: int, m: int) -> tuple[float, float]:
     """Factors of P(band) = step * (z P(band-1) - back * P(band-2)), fully normalised."""
     step = math.sqrt((4.0 * band * band - 1.0) / (band * band - m * m))
