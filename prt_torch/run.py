@@ -32,6 +32,7 @@ from prt_torch.representations import (
     ScatteredSRBF,
     SegmentedCPCA,
     WaveletTransfer,
+    ZonalLobes,
     load,
     save,
 )
@@ -44,6 +45,7 @@ from prt_torch.settings import (
     ScatteredSRBFConfig,
     SegmentedCPCAConfig,
     WaveletConfig,
+    ZonalLobesConfig,
 )
 from prt_torch.transfer import TransferTensor
 
@@ -249,6 +251,8 @@ def _closed_form(
             )
         case WaveletConfig():
             return WaveletTransfer.from_transfer(transfer, **options)
+        case ZonalLobesConfig():
+            return ZonalLobes.from_transfer(transfer, **options, **common)
 
 
 def _clustered(

@@ -238,8 +238,30 @@ class WaveletConfig(_Section):
         return f"{self.name} {self.num_terms}{codes}{cut}"
 
 
+class ZonalLobesConfig(_Section):
+    """Sloan, Luna, Snyder 2005, for spherical-harmonic light."""
+
+    name: Literal["zonal_lobes"] = "zonal_lobes"
+    num_lobes: int = Field(4, ge=1, le=16, description="of each row of a point")
+    effort: Literal["default", "fast"] = Field("default", description="of the search for axes")
+    ridge: float = Field(1e-7, ge=1e-12, le=1, description="keeps lobes from growing without bound")
+    bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
+
+    @property
+    def label(self) -> str:
+        """Name of the result."""
+        effort = "" if self.effort == "default" else f" {self.effort}"
+        bits = "" if self.bits else " float"
+        return f"{self.name} {self.num_lobes}{effort}{bits}"
+
+
 RepresentationConfig = Annotated[
-    CPCAConfig | ClusteredTensorConfig | ScatteredSRBFConfig | SegmentedCPCAConfig | WaveletConfig,
+    CPCAConfig
+    | ClusteredTensorConfig
+    | ScatteredSRBFConfig
+    | SegmentedCPCAConfig
+    | WaveletConfig
+    | ZonalLobesConfig,
     Field(discriminator="name"),
 ]
 
@@ -249,6 +271,7 @@ KINDS: dict[str, type[_Section]] = {
     "scattered_srbf": ScatteredSRBFConfig,
     "segmented_cpca": SegmentedCPCAConfig,
     "wavelet": WaveletConfig,
+    "zonal_lobes": ZonalLobesConfig,
 }
 """The closed registry of representations that a run can fit, told apart by ``name``."""
 

@@ -24,7 +24,7 @@ from prt_torch.bases.srbf_objective import (
 from prt_torch.bases.srbf_seeds import coverage_seeds, relocate
 from prt_torch.errors import InputError
 from prt_torch.representations import ScatteredSRBF, scattered_srbf_encoding
-from prt_torch.representations.scattered_srbf_coding import from_octahedron, to_octahedron
+from prt_torch.representations.octahedron import from_octahedron, to_octahedron
 from prt_torch.sphere import (
     cubemap_directions,
     cubemap_index,

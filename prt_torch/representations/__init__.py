@@ -8,6 +8,7 @@ from prt_torch.representations.files import load, save
 from prt_torch.representations.scattered_srbf import ScatteredSRBF
 from prt_torch.representations.segmented_cpca import SegmentedCPCA
 from prt_torch.representations.wavelet import WaveletTransfer
+from prt_torch.representations.zonal_lobes import ZonalLobes
 
 __all__ = [
     "CPCA",
@@ -17,6 +18,7 @@ __all__ = [
     "ScatteredSRBF",
     "SegmentedCPCA",
     "WaveletTransfer",
+    "ZonalLobes",
     "load",
     "save",
 ]

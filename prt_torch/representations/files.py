@@ -17,6 +17,7 @@ from prt_torch.representations.dense import DenseTransfer
 from prt_torch.representations.scattered_srbf import ScatteredSRBF
 from prt_torch.representations.segmented_cpca import SegmentedCPCA
 from prt_torch.representations.wavelet import WaveletTransfer
+from prt_torch.representations.zonal_lobes import ZonalLobes
 from prt_torch.transfer import Surface
 
 KINDS: dict[str, type[Representation]] = {
@@ -28,6 +29,7 @@ KINDS: dict[str, type[Representation]] = {
         ScatteredSRBF,
         SegmentedCPCA,
         WaveletTransfer,
+        ZonalLobes,
     )
 }
 """The closed registry of representations: name in configurations and files, to class."""

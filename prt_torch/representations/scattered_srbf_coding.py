@@ -1,30 +1,29 @@
 """Scattered functions and weights as integer codes: what a file holds.
 
-A centre is two codes of 16 bits on the octahedral map, which spreads them evenly over the sphere
-(7e-5 rad at most lie between a direction and its code); a bandwidth is one code of its logarithm,
-so that it keeps as many digits whether wide or narrow. Weights have a step for each function of a
-cluster, so that functions of little use keep their digits beside strong ones.
+A centre is two codes of 16 bits (``octahedron``); a bandwidth is one code of its logarithm, so that
+it keeps as many digits whether wide or narrow. Weights have a step for each function of a cluster,
+so that functions of little use keep their digits beside strong ones.
 
 Source:
     Tsai, Shih 2006, section 7 (16 bits; no steps are stated). Codes of centres and bandwidths are
-    ours; the octahedral map is that of Meyer, Süßmuth, Sußner, Stamminger, Greiner 2010.
+    ours.
 """
 
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float, Int, Int16
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from prt_torch.quantize import (
     dequantize,
     full_scale,
-    largest_code,
     least_unsigned,
     quantize,
     rounded_up,
     straight_through,
 )
+from prt_torch.representations.octahedron import from_octahedron, to_octahedron
 
 BITS = 16
 _LOG_STEP = 2.0**-11  # of log bandwidths: 2.4e-4 of a bandwidth, from e^-16 to e^16
@@ -114,32 +113,6 @@ def rounded_functions(
 
 def _on_codes(centers: Float[Tensor, "clusters n 3"]) -> Float[Tensor, "clusters n 3"]:
     return from_octahedron(to_octahedron(centers), centers.dtype)
-
-
-def to_octahedron(directions: Float[Tensor, "*batch 3"]) -> Int16[Tensor, "*batch 2"]:
-    """Directions, of any length but zero, on the unfolded octahedron, at the nearest 16-bit codes.
-
-    Where two codes stand for one direction, along the edges of the lower half, signs of zeros tell
-    them apart, so that codes of decoded codes are the same codes.
-    """
-    directions = directions.detach().double()
-    x, y, z = (directions / directions.abs().sum(-1, keepdim=True)).unbind(-1)
-    below = z < 0
-    folded_x, folded_y = torch.copysign(1.0 - y.abs(), x), torch.copysign(1.0 - x.abs(), y)
-    flat = torch.stack([torch.where(below, folded_x, x), torch.where(below, folded_y, y)], dim=-1)
-    return quantize(flat, 1.0 / largest_code(BITS), BITS)
-
-
-def from_octahedron(
-    codes: Int16[Tensor, "*batch 2"], dtype: torch.dtype
-) -> Float[Tensor, "*batch 3"]:
-    """The unit vectors that codes stand for."""
-    x, y = (codes.double() / largest_code(BITS)).unbind(-1)
-    z = 1.0 - x.abs() - y.abs()
-    below = z < 0
-    unfolded_x, unfolded_y = torch.copysign(1.0 - y.abs(), x), torch.copysign(1.0 - x.abs(), y)
-    x, y = torch.where(below, unfolded_x, x), torch.where(below, unfolded_y, y)
-    return torch.nn.functional.normalize(torch.stack([x, y, z], dim=-1), dim=-1).to(dtype)
 
 
 def pack(encoding: ScatteredEncoding) -> dict[str, Tensor]:

@@ -1,0 +1,353 @@
+r"""Transfer as sums of zonal lobes, which turn with the surface.
+
+Each row of a point's transfer is a sum of a few functions that are symmetric around axes of their
+own (:mod:`prt_torch.bases.zonal`),
+
+.. math:: T_{p,r}(s) \approx \sum_{i=1}^{N} \sum_l g^*_{il}\; y_l(s_i) \cdot y_l(s).
+
+Where the surface deforms, the transfer at a point turns with its frame, and that of a sum of lobes
+by turning N axes: no representation by coefficients of light can do so. Light, by spherical
+harmonics, may turn too, or differ from point to point. Radiance takes the light's band l at each
+axis, :math:`\hat e_l(s_i) = \sum_m y_{lm}(s_i)\, e_{lm}`, times the lobe's coefficient of the band.
+
+Three lobes can meet any constant and linear term, so from three on those four coefficients are kept
+as they are, and lobes are fitted to, and have coefficients for, the bands from 2 on. Constant and
+linear terms may be interpolated over the surface, which lobes may not.
+
+The turn carries what happens near the point, such as the shadow of a bump, and leaves out what
+happens far away, whose shadow would not move with the point.
+
+Source:
+    Sloan, Luna, Snyder 2005, sections 3.1, 3.2, 4.1 and 5. Light is exact at every axis: the paper
+    looks it up in a table of 64 x 32 directions.
+"""
+
+import time
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from prt_torch.bases import SphericalHarmonics, sh, zonal
+from prt_torch.metric import Metric
+from prt_torch.representations.base import CodedRepresentation
+from prt_torch.representations.zonal_lobes_coding import BITS, Lobes, on_codes, pack, unpack
+from prt_torch.representations.zonal_lobes_search import Effort, search
+from prt_torch.transfer import Surface, TransferTensor
+
+LINEAR_LOBES = 3
+"""Lobes from which on constant and linear terms are kept beside them."""
+
+_BLOCK_BYTES = 2**25  # of light at lobes, of points that are relit at once
+
+
+class ZonalLobes(CodedRepresentation):
+    """A few lobes for each row of each point.
+
+    Parameters are ``axes`` ``"points rows lobes 3"``, taken by their directions, in the world frame
+    of the rest pose; ``coefficients`` ``"points rows lobes bands"``, the g* of the paper; and
+    ``linear`` ``"points rows low"``, harmonics of bands 0 and 1 where there are at least three
+    lobes (low is 4, or 1 at order 1), else of no elements. Rows of three channels come one channel
+    after the other.
+
+    Args:
+        lobes: Axes and coefficients.
+        steps: Of codes, as :meth:`Lobes.steps`; None where parameters are kept as they are.
+        surface: Bases, frames and reflectance; the rest frames are needed to pose it.
+        shape: Points, channels, rows, coeffs.
+
+    Attributes:
+        bits: Of a code; None where parameters are kept as they are.
+        statistics: ``largest_coefficient`` (of g*), ``starts``, ``steps`` (evaluations),
+            ``unfinished`` (fits that were ended by the limit of steps), ``seconds``; empty if
+            loaded.
+
+    Raises:
+        ValueError: If the light basis is not one of spherical harmonics.
+    """
+
+    kind: ClassVar[str] = "zonal_lobes"
+    axes: nn.Parameter
+    coefficients: nn.Parameter
+    linear: nn.Parameter
+    _steps: Tensor | None
+
+    def __init__(
+        self,
+        lobes: Lobes,
+        steps: Float[Tensor, "points rows"] | None,
+        surface: Surface,
+        shape: tuple[int, int, int, int],
+    ):
+        super().__init__(surface, shape)
+        self.order = _order(surface)
+        self.bits: Literal[16] | None = None if steps is None else BITS
+        self.statistics: dict[str, float] = {}
+        self._condition = float("nan")
+        for name in Lobes.names():
+            values = getattr(lobes, name).detach()
+            copy = values.clone(memory_format=torch.contiguous_format)
+            self.register_parameter(name, nn.Parameter(copy))
+        self.register_buffer("_steps", steps)
+        self._rest()
+
+    @classmethod
+    def from_transfer(
+        cls,
+        transfer: TransferTensor,
+        *,
+        num_lobes: int = 4,
+        effort: Effort = "default",
+        ridge: float = 1e-7,
+        bits: Literal[16] | None = 16,
+        metric: Metric | None = None,
+        generator: torch.Generator | None = None,
+    ) -> "ZonalLobes":
+        """Fit the lobes of all rows of all points, side by side.
+
+        Args:
+            transfer: The tensor to stand for, in spherical harmonics of any order.
+            num_lobes: Of each row of a point, at least 1.
+            effort: ``default``, or ``fast``: a twentieth of the time, for two to three times the
+                squared error of diffuse transfer by four lobes.
+            ridge: Share of the squared norms of lobes that is added to the squared error, at least
+                ``1e-12``; keeps pairs of lobes from growing against each other.
+            bits: Of a code; None keeps parameters as they are.
+            metric: Not used: lobes are fitted in L2 over the sphere, row by row. What errors are
+                worth enters with the refinement by gradients.
+            generator: Source of random starts; seed 0 if not given.
+
+        Raises:
+            ValueError: If an option is out of range, or the transfer is not in spherical
+                harmonics.
+
+        Source:
+            Sloan, Luna, Snyder 2005, sections 4.1 and 5, with coefficients eliminated
+            (:mod:`prt_torch.representations.zonal_lobes_objective`) and another search
+            (:mod:`prt_torch.representations.zonal_lobes_search`).
+        """
+        _check_options(transfer, num_lobes, ridge, bits)
+        start = time.perf_counter()
+        values = transfer.dense().flatten(1, 2)  # points, rows, coeffs
+        values = values.to(torch.promote_types(values.dtype, torch.float32))
+        own_linear = num_lobes >= LINEAR_LOBES
+        found = search(
+            values.flatten(0, 1),
+            num_lobes,
+            first_band=2 if own_linear else 1,
+            ridge=ridge,
+            effort=effort,
+            generator=generator or torch.Generator().manual_seed(0),
+        )
+        axes = found.axes.unflatten(0, values.shape[:2]).to(values)
+        axes = axes if bits is None else on_codes(axes)
+        lobes = _solved(values, axes, ridge, own_linear)
+        steps = None if bits is None else lobes.steps()
+        lobes = lobes if steps is None else lobes.rounded(steps)
+        model = cls(lobes, steps, transfer.surface, tuple(transfer.values.shape))
+        model._condition = _worst_condition(lobes, model.order, ridge)
+        model.statistics = {
+            "largest_coefficient": _largest(lobes.coefficients),
+            **{name: getattr(found, name) for name in ("starts", "steps", "unfinished")},
+            "seconds": time.perf_counter() - start,
+        }
+        return model
+
+    @property
+    def num_lobes(self) -> int:
+        """Of each row of a point."""
+        return self.axes.shape[2]
+
+    @property
+    def first_band(self) -> int:
+        """The first that lobes have coefficients of."""
+        return self.order - self.coefficients.shape[3]
+
+    def _values(self) -> Lobes:
+        """Parameters as a file would hold them, while gradients refine them."""
+        lobes = Lobes(self.axes, self.coefficients, self.linear)
+        if self._steps is None or self._at_rest or not self.training:
+            return lobes
+        return lobes.straight_through(self._steps)
+
+    def _rounded(self) -> dict[str, Tensor]:
+        lobes = Lobes(self.axes, self.coefficients, self.linear)
+        if self._steps is not None:
+            lobes = lobes.rounded(self._steps)
+        return {name: getattr(lobes, name) for name in Lobes.names()}
+
+    def forward(
+        self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
+    ) -> Float[Tensor, "batch points rows rgb"]:
+        """The light's bands at each axis, times the lobes' coefficients.
+
+        Args:
+            light: In world coordinates.
+            frames: Shading frames of the deformed surface, rows tangent, bitangent and normal: what
+                points the same way in a point's frame as at rest is what its transfer turns to.
+
+        Raises:
+            ValueError: If shapes do not fit, or ``frames`` are given and the surface has none to
+                tell how it stood at rest (:func:`load` takes them as ``geometry``).
+
+        Source:
+            Sloan, Luna, Snyder 2005, equations 10, 24 and 25.
+        """
+        local = self._check_light(light)
+        coloured = self._by_channel(light, local)
+        lobes, turns = self._values(), self._turns(frames)
+        count = len(coloured) * self.axes.shape[1] * self.num_lobes
+        step = max(1, _BLOCK_BYTES // (count * light.element_size()))
+        pieces = []
+        for first in range(0, self.num_points, step):
+            some = slice(first, first + step)
+            own = Lobes(*(getattr(lobes, name)[some] for name in Lobes.names()))
+            turn = None if turns is None else turns[some]
+            lit = coloured[:, :, some] if local else coloured
+            pieces.append(self._relit(own, lit, turn))
+        radiance = torch.cat(pieces, dim=1) if len(pieces) > 1 else pieces[0]
+        by_colour = radiance.unflatten(0, (len(light), -1)).permute(0, 2, 4, 1, 3)
+        return by_colour.flatten(3)
+
+    def _by_channel(
+        self, light: Tensor, local: bool
+    ) -> Float[Tensor, "lights channels points_or_one coeffs"]:
+        """One light for each colour where channels are shared, else one colour a channel."""
+        by_point = light if local else light[:, None]
+        colours = by_point.permute(0, 3, 1, 2)  # batch rgb points coeffs
+        return colours.flatten(0, 1)[:, None] if self.num_channels == 1 else colours
+
+    def _turns(self, frames: Tensor | None) -> Float[Tensor, "points 3 3"] | None:
+        """Rotations from the rest pose to another one."""
+        if frames is None:
+            return None
+        if frames.shape != (self.num_points, 3, 3):
+            raise ValueError(f'expected frames "{self.num_points} 3 3", got {tuple(frames.shape)}')
+        rest = self._surface.frames
+        if rest is None:
+            raise ValueError("expected a surface with frames at rest to be posed by others")
+        return frames.mT @ rest.to(frames)
+
+    def _relit(
+        self,
+        lobes: Lobes,
+        light: Float[Tensor, "lights channels points_or_one coeffs"],
+        turns: Float[Tensor, "points 3 3"] | None,
+    ) -> Float[Tensor, "lights points channels rows"]:
+        """Radiance of some points."""
+        axes, linear = zonal.unit_axes(lobes.axes), lobes.linear
+        if turns is not None:
+            axes = torch.einsum("pij,prnj->prni", turns, axes)
+            linear = _turned(linear, turns)
+        split = (self.num_channels, self.num_rows)
+        harmonics = sh.evaluate(axes, self.order).unflatten(1, split)
+        weights = lobes.coefficients.unflatten(1, split)
+        low = linear.shape[-1]
+        total = _met(linear.unflatten(1, split)[:, :, :, None], light[..., :low])[..., 0]
+        for index, band in enumerate(range(self.first_band, self.order)):
+            own = slice(band * band, (band + 1) ** 2)
+            at_axes = _met(harmonics[..., own], light[..., own])
+            total = total + torch.einsum("qpcrn,pcrn->qpcr", at_axes, weights[..., index])
+        return total
+
+    def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
+        """Sums of the lobes' harmonics, in the rest pose."""
+        lobes = self._values()
+        if points is not None:
+            lobes = Lobes(*(getattr(lobes, name)[points] for name in Lobes.names()))
+        filled = nn.functional.pad(lobes.coefficients, (self.first_band, 0))
+        harmonics = zonal.lobes_to_sh(lobes.axes, filled)
+        low = lobes.linear.shape[-1]
+        values = torch.cat([lobes.linear, harmonics[..., low:]], dim=-1)
+        return values.unflatten(1, (self.num_channels, self.num_rows))
+
+    def packed(self) -> dict[str, Tensor]:
+        """Codes and steps, or parameters (:func:`zonal_lobes_coding.pack`)."""
+        return pack(Lobes(self.axes, self.coefficients, self.linear), self._steps)
+
+    @classmethod
+    def from_packed(
+        cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
+    ) -> "ZonalLobes":
+        """The inverse of :meth:`packed`."""
+        return cls(*unpack(packed), surface, shape)
+
+    @property
+    def budget(self) -> dict[str, Any]:
+        """Lobes of each row of a point."""
+        return {"num_lobes": self.num_lobes}
+
+    @property
+    def condition(self) -> float:
+        """Of the worst solve for coefficients, ridge included; NaN if loaded."""
+        return self._condition
+
+
+def _order(surface: Surface) -> int:
+    """Bands of the light basis."""
+    basis = surface.light_basis
+    if not isinstance(basis, SphericalHarmonics):
+        given = basis.name if basis else None
+        raise ValueError(f"expected transfer in spherical harmonics for lobes, got {given}")
+    return basis.order
+
+
+def _check_options(
+    transfer: TransferTensor, num_lobes: int, ridge: float, bits: int | None
+) -> None:
+    _order(transfer.surface)
+    if num_lobes < 1:
+        raise ValueError(f"expected at least 1 lobe, got {num_lobes}")
+    if bits not in (BITS, None):
+        raise ValueError(f"expected 16 bits or None, got {bits!r}")
+    if not ridge >= zonal.LEAST_RIDGE:
+        raise ValueError(f"expected a ridge of at least {zonal.LEAST_RIDGE:g}, got {ridge:g}")
+
+
+def _solved(
+    values: Float[Tensor, "points rows coeffs"],
+    axes: Float[Tensor, "points rows lobes 3"],
+    ridge: float,
+    own_linear: bool,
+) -> Lobes:
+    """The coefficients closest to transfer at these axes."""
+    coefficients = zonal.fit_coefficients(values, axes, ridge)
+    if not own_linear:
+        return Lobes(axes, coefficients, values[..., :0])
+    return Lobes(axes, coefficients[..., 2:], values[..., :4])
+
+
+def _worst_condition(lobes: Lobes, order: int, ridge: float) -> float:
+    """Of the matrices that coefficients were solved with."""
+    axes, bands = lobes.axes.double(), lobes.coefficients.shape[-1]
+    if lobes.coefficients.numel() == 0:
+        return 1.0
+    grams = zonal.legendre(axes @ axes.mT, order)[..., order - bands :].movedim(-1, -3)
+    spectra = torch.linalg.eigvalsh(grams).clamp_min(0.0) + ridge
+    return float((spectra[..., -1] / spectra[..., 0]).max())
+
+
+def _largest(coefficients: Tensor) -> float:
+    return float(coefficients.abs().max()) if coefficients.numel() else 0.0
+
+
+def _turned(
+    linear: Float[Tensor, "points rows low"], turns: Float[Tensor, "points 3 3"]
+) -> Float[Tensor, "points rows low"]:
+    """Constant and linear terms after a turn; linear ones are a vector, in the order y, z, x."""
+    if linear.shape[-1] < 4:
+        return linear
+    constant, y, z, x = linear.unbind(-1)
+    x, y, z = torch.einsum("pij,prj->ipr", turns, torch.stack([x, y, z], dim=-1))
+    return torch.stack([constant, y, z, x], dim=-1)
+
+
+def _met(
+    functions: Float[Tensor, "points channels rows lobes some"],
+    light: Float[Tensor, "lights channels points_or_one some"],
+) -> Float[Tensor, "lights points channels rows lobes"]:
+    """Light at each of the functions, of each point its own light or the same."""
+    if light.shape[2] == 1:
+        return torch.einsum("pcrnm,qcm->qpcrn", functions, light[:, :, 0])
+    return torch.einsum("pcrnm,qcpm->qpcrn", functions, light)
