@@ -310,6 +310,15 @@ class TestCenters:
         eigenvalues = torch.linalg.eigvalsh(values)
         assert float(eigenvalues[-1] / eigenvalues[0]) == pytest.approx(collocation, rel=2e-3)
 
+    def test_the_paper_read_as_a_variance_is_singular(self):
+        """π/40 as a variance: collocation at 1.39e10, and no float64 factor of the Gram matrix."""
+        wide = SRBF(bandwidth=12.477)
+        values = srbf.gaussian(wide.centers, wide.centers, wide.bandwidths)
+        eigenvalues = torch.linalg.eigvalsh(values)
+        assert float(eigenvalues[-1] / eigenvalues[0]) == pytest.approx(1.39e10, rel=0.01)
+        assert wide.condition > 1e15
+        assert torch.linalg.cond(wide.gram()) == pytest.approx(1e8, rel=0.01)
+
 
 class TestProjections:
     def test_centers_that_coincide_share_alike(self):

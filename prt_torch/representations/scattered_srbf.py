@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from prt_torch.bases import EnvironmentFit, LightBasis, Radiance, fit_environment
 from prt_torch.metric import Metric
-from prt_torch.representations.base import Representation
+from prt_torch.representations.base import CodedRepresentation
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.representations.products import matmul_few
 from prt_torch.representations.scattered_srbf_coding import (
@@ -41,15 +41,12 @@ from prt_torch.representations.scattered_srbf_encoding import encode, in_light_b
 from prt_torch.transfer import Surface, TransferTensor
 
 
-class ScatteredSRBF(Representation):
+class ScatteredSRBF(CodedRepresentation):
     """Gaussians at free places, shared by clusters of points.
 
     Parameters are ``centers`` ``"clusters n 3"``, taken by their directions, ``log_bandwidths``
     ``"clusters n"``, so that bandwidths are positive, and ``weights``
     ``"points channels rows n"``.
-
-    Where the module is in training mode, gradients pass straight through the parameters' rounding
-    to 16-bit codes; leaving it (:meth:`train`, ``eval``) rounds them to what a file holds.
 
     Args:
         encoding: Clusters, functions and weights.
@@ -151,29 +148,13 @@ class ScatteredSRBF(Representation):
         )
         return cls(encoding, transfer.surface, tuple(transfer.values.shape))
 
-    def train(self, mode: bool = True) -> "ScatteredSRBF":
-        """Enter training; on leaving it, round the parameters to what a file holds."""
-        if not mode and not self._at_rest:
-            with torch.no_grad():
-                rounded = self._encoding().rounded().parameters
-                for name in Parameters.names():
-                    getattr(self, name).copy_(getattr(rounded, name))
-            self._rest()
-        super().train(mode)
-        return self
+    def _rounded(self) -> dict[str, Tensor]:
+        rounded = self._encoding().rounded().parameters
+        return {name: getattr(rounded, name) for name in Parameters.names()}
 
     def _rest(self) -> None:
-        """Remember that the parameters are what a file holds, and forget their functions."""
-        parameters = (getattr(self, name) for name in Parameters.names())
-        self._resting = [(one, one._version) for one in parameters]
+        super()._rest()
         self.register_buffer("_functions_at_rest", None, persistent=False)
-
-    @property
-    def _at_rest(self) -> bool:
-        """Whether no parameter has been replaced or written to since."""
-        now = (getattr(self, name) for name in Parameters.names())
-        pairs = zip(self._resting, now, strict=True)
-        return all(one is then and one._version == version for (then, version), one in pairs)
 
     def _encoding(self) -> ScatteredEncoding:
         parameters = Parameters(**{name: getattr(self, name) for name in Parameters.names()})
