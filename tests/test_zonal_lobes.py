@@ -345,8 +345,15 @@ def test_wrong_options_are_refused(without_type_checker):
     transfer = TransferTensor.from_dense(torch.zeros(2, cube.num_coeffs), light_basis=cube)
     with pytest.raises(ValueError, match="expected transfer in spherical harmonics"):
         ZonalLobes.from_transfer(transfer)
-    with pytest.raises(ValueError, match="got None"):
-        ZonalLobes.from_transfer(TransferTensor.from_dense(values))
+    with pytest.raises(ValueError, match="got 10 coeffs without a light basis"):
+        ZonalLobes.from_transfer(TransferTensor.from_dense(torch.zeros(2, 10)))
+
+
+def test_a_square_number_of_coefficients_is_taken_for_harmonics():
+    values = random_functions(4)
+    plain = ZonalLobes.from_transfer(TransferTensor.from_dense(values), num_lobes=2, effort="fast")
+    known = ZonalLobes.from_transfer(harmonic_transfer(values), num_lobes=2, effort="fast")
+    assert torch.equal(plain.dense(), known.dense())
 
 
 def test_a_search_says_what_it_took():

@@ -22,6 +22,7 @@ Source:
     looks it up in a table of 64 x 32 directions.
 """
 
+import math
 import time
 from typing import Any, ClassVar, Literal
 
@@ -81,7 +82,7 @@ class ZonalLobes(CodedRepresentation):
         shape: tuple[int, int, int, int],
     ):
         super().__init__(surface, shape)
-        self.order = _order(surface)
+        self.order = _order(surface, shape[3])
         self.bits: Literal[16] | None = None if steps is None else BITS
         self.statistics: dict[str, float] = {}
         self._condition = float("nan")
@@ -107,7 +108,8 @@ class ZonalLobes(CodedRepresentation):
         """Fit the lobes of all rows of all points, side by side.
 
         Args:
-            transfer: The tensor to stand for, in spherical harmonics of any order.
+            transfer: The tensor to stand for, in spherical harmonics of any order; one without a
+                light basis is taken for that if its coefficients are a square number.
             num_lobes: Of each row of a point, at least 1.
             effort: ``default``, or ``fast``: a twentieth of the time, for two to three times the
                 squared error of diffuse transfer by four lobes.
@@ -284,19 +286,22 @@ class ZonalLobes(CodedRepresentation):
         return self._condition
 
 
-def _order(surface: Surface) -> int:
-    """Bands of the light basis."""
+def _order(surface: Surface, num_coeffs: int) -> int:
+    """Bands of the light basis; without one, those of as many harmonics."""
     basis = surface.light_basis
-    if not isinstance(basis, SphericalHarmonics):
-        given = basis.name if basis else None
+    if isinstance(basis, SphericalHarmonics):
+        return basis.order
+    order = math.isqrt(num_coeffs)
+    if basis is not None or order * order != num_coeffs:
+        given = basis.name if basis else f"{num_coeffs} coeffs without a light basis"
         raise ValueError(f"expected transfer in spherical harmonics for lobes, got {given}")
-    return basis.order
+    return order
 
 
 def _check_options(
     transfer: TransferTensor, num_lobes: int, ridge: float, bits: int | None
 ) -> None:
-    _order(transfer.surface)
+    _order(transfer.surface, transfer.num_coeffs)
     if num_lobes < 1:
         raise ValueError(f"expected at least 1 lobe, got {num_lobes}")
     if bits not in (BITS, None):
