@@ -135,8 +135,9 @@ def test_side_by_side_is_one_after_the_other():
     basis = CubeDirections(RESOLUTION)
     names = ("sunset", "area_lights")
     lights = torch.stack([basis.project(find_environment(name)) for name in names])
-    together = fit_texels(lights, 10, rounds=2)
-    alone = [fit_texels(light[None], 10, rounds=2) for light in lights]
+    # Without relocations: which function moves is a choice that rounding may turn.
+    together = fit_texels(lights, 10, rounds=0, max_steps=5)
+    alone = [fit_texels(light[None], 10, rounds=0, max_steps=5) for light in lights]
     expected = [fit.squared_error[0] for fit in alone]
     assert together.squared_error == pytest.approx(expected, rel=1e-3)
     assert together.steps == tuple(fit.steps[0] for fit in alone)

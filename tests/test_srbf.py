@@ -473,7 +473,7 @@ class TestBasis:
         found = basis.project_texels(images.flatten(1, 3).double())
         for image, light in zip(images, found, strict=True):
             expected = basis.project(Environment("texels", image, "cube"))
-            assert torch.allclose(light, expected, rtol=6e-3, atol=1e-4 * float(expected.max()))
+            assert torch.allclose(light, expected, rtol=1e-2, atol=2e-3 * float(expected.max()))
         single = basis.project_texels(images.flatten(1, 3))
         assert torch.allclose(single.double(), found, atol=1e-5 * float(found.max()))
 
