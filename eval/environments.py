@@ -24,9 +24,8 @@ from torch import Tensor
 
 from prt_torch.assets import load_environment
 from prt_torch.bases import CubeDirections, Haar, sh
-from prt_torch.bases.srbf_fitting import EnvironmentFit, fit_texels
+from prt_torch.bases.srbf_fitting import EnvironmentFit, fit_texels, seeds
 from prt_torch.bases.srbf_objective import TexelObjective
-from prt_torch.bases.srbf_seeds import coverage_seeds
 from prt_torch.command import main
 from prt_torch.errors import InputError
 from prt_torch.preview.images import automatic_exposure, write_png
@@ -139,12 +138,8 @@ def in_harmonics(light: Tensor) -> Tensor:
 def by_lbfgs(light: Tensor) -> list[str]:
     """Error, seconds and iterations of L-BFGS-B on the same objective from the same seeds."""
     objective = TexelObjective(light[None], "gaussian")
-    coarse = CubeDirections(RESOLUTION // 2)
-    flux = light * CubeDirections(RESOLUTION).solid_angles[:, None]
-    means = coarse.project_cube(flux.mT, RESOLUTION).mT / coarse.solid_angles[:, None]
-    directions = cubemap_directions(coarse.resolution, dtype=torch.float64).view(-1, 3)
     start = time.perf_counter()
-    centers, widths = coverage_seeds(means, directions, NUM_FUNCTIONS)
+    centers, log_widths = (one[0] for one in seeds(objective, NUM_FUNCTIONS))
 
     def of(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
         raw = torch.from_numpy(unknowns).view(NUM_FUNCTIONS, 4)
@@ -155,7 +150,7 @@ def by_lbfgs(light: Tensor) -> list[str]:
         along = along / raw[:, :3].norm(dim=1, keepdim=True)
         return float(at.objective), torch.cat([along, wider[:, None]], dim=1).flatten().numpy()
 
-    begin = torch.cat([centers, widths.log()[:, None]], dim=1).flatten().numpy()
+    begin = torch.cat([centers, log_widths[:, None]], dim=1).flatten().numpy()
     options = {"maxiter": LBFGS_STEPS, "maxfun": 2 * LBFGS_STEPS}
     found = scipy.optimize.minimize(of, begin, jac=True, method="L-BFGS-B", options=options)
     return [f"{found.fun:.2e}", f"{time.perf_counter() - start:.1f}", str(found.nit)]

@@ -27,16 +27,13 @@ from prt_torch.metric import Metric
 from prt_torch.report import summary_table
 from prt_torch.representations import (
     CPCA,
-    ClusteredTensor,
     Representation,
-    ScatteredSRBF,
-    SegmentedCPCA,
     WaveletTransfer,
-    ZonalLobes,
     load,
     save,
 )
 from prt_torch.representations.cpca_relabel import reclassified
+from prt_torch.representations.files import KINDS
 from prt_torch.settings import (
     ClusteredTensorConfig,
     CPCAConfig,
@@ -45,7 +42,6 @@ from prt_torch.settings import (
     ScatteredSRBFConfig,
     SegmentedCPCAConfig,
     WaveletConfig,
-    ZonalLobesConfig,
 )
 from prt_torch.transfer import TransferTensor
 
@@ -237,22 +233,11 @@ def _closed_form(
     match wanted:
         case CPCAConfig():
             return _clustered(wanted, inputs, transfer, common)
-        case SegmentedCPCAConfig():
-            budget = config.memory_budget
-            return SegmentedCPCA.from_transfer(transfer, memory_budget=budget, **options, **common)
-        case ClusteredTensorConfig():
-            budget = config.memory_budget
-            return ClusteredTensor.from_transfer(
-                transfer, memory_budget=budget, **options, **common
-            )
-        case ScatteredSRBFConfig():
-            return ScatteredSRBF.from_transfer(
-                transfer, memory_budget=config.memory_budget, **options, **common
-            )
         case WaveletConfig():
             return WaveletTransfer.from_transfer(transfer, **options)
-        case ZonalLobesConfig():
-            return ZonalLobes.from_transfer(transfer, **options, **common)
+        case SegmentedCPCAConfig() | ClusteredTensorConfig() | ScatteredSRBFConfig():
+            common["memory_budget"] = config.memory_budget
+    return KINDS[wanted.name].from_transfer(transfer, **options, **common)
 
 
 def _clustered(

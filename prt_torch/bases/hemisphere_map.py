@@ -174,9 +174,7 @@ class HemisphereMap:
         columns = torch.stack([column, (column + 1) % self.resolution], -1)
         lines = torch.stack([line, line + 1], -1)
         indices = (lines[..., :, None] * self.resolution + columns[..., None, :]).flatten(-2)
-        shares = torch.stack([1 - right, right], -1)
-        heights = torch.stack([1 - lower, lower], -1)
-        return indices, (heights[..., :, None] * shares[..., None, :]).flatten(-2)
+        return indices, _bilinear(right, lower)
 
     def lookup(
         self, texels: Float[Tensor, "rows texels"], directions: Float[Tensor, "*batch 3"]
@@ -185,9 +183,7 @@ class HemisphereMap:
         cell, right, lower = self.cells(*to_horizon(directions).unbind(-1))
         line = self.resolution + 1
         steps = torch.tensor([0, 1, line, line + 1], device=cell.device)
-        across, beside = right * (1 - lower), right * lower
-        above = 1 - lower - across
-        weights = torch.stack([above, across, lower - beside, beside], -1).to(texels)
+        weights = _bilinear(right, lower).to(texels)
         indices, padded = cell[..., None] + steps, self.pad(texels).mT
         if torch.is_grad_enabled() and (texels.requires_grad or directions.requires_grad):
             return (padded[indices] * weights[..., None]).sum(-2)
@@ -199,6 +195,15 @@ class HemisphereMap:
             per_sample_weights=weights.reshape(-1, 4),
         )
         return found.view(*directions.shape[:-1], len(texels))
+
+
+def _bilinear(
+    right: Float[Tensor, "*batch"], lower: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4"]:
+    """Weights of four texels, line by line, by the shares of the right and of the lower ones."""
+    shares = torch.stack([1 - right, right], -1)
+    heights = torch.stack([1 - lower, lower], -1)
+    return (heights[..., :, None] * shares[..., None, :]).flatten(-2)
 
 
 def _safe_sqrt(values: Tensor) -> Tensor:

@@ -23,9 +23,8 @@ from prt_torch.quantize import (
     rounded_up,
     straight_through,
 )
-from prt_torch.representations.octahedron import from_octahedron, to_octahedron
+from prt_torch.representations.octahedron import BITS, from_octahedron, to_octahedron
 
-BITS = 16
 _LOG_STEP = 2.0**-11  # of log bandwidths: 2.4e-4 of a bandwidth, from e^-16 to e^16
 
 
