@@ -46,7 +46,8 @@ class Relighter(nn.Module):
         self,
         light: Tensor | Radiance | Sequence[Radiance],
         views: Float[Tensor, "views *points 3"] | None = None,
-        frames: Float[Tensor, "points 3 3"] | None = None,
+        frames: Float[Tensor, "*batch points 3 3"] | None = None,
+        positions: Float[Tensor, "*batch points 3"] | None = None,
     ) -> Float[Tensor, "batch views points rgb"]:
         """Outgoing radiance.
 
@@ -56,7 +57,10 @@ class Relighter(nn.Module):
             views: Where each viewer is, ``"views 3"`` in mesh units, or unit directions towards
                 it ``"views points 3"``. Diffuse transfer skips them: its views dimension has size
                 1, whatever is given here.
-            frames: Shading frames of a deformed surface.
+            frames: Shading frames of a deformed surface: one pose for all lights, or a sequence
+                ``"batch points 3 3"``, a pose for each light. A single light serves all poses.
+            positions: Where the points of the deformed surface are, of one pose or of each, for
+                viewers in mesh units; where they were at rest if not given.
 
         Returns:
             Linear RGB radiance, reflectance included.
@@ -66,7 +70,10 @@ class Relighter(nn.Module):
         """
         if not isinstance(light, Tensor):
             light = self.project(light)
-        rows = self._view_rows(views, frames)
+        if frames is not None and frames.ndim == 4:
+            sequence = _sequence(light, frames, positions)
+            return torch.cat([self(lit, views, pose, where) for lit, pose, where in sequence])
+        rows = self._view_rows(views, frames, positions)
         radiance_bytes = 3 * self.representation.num_points * self.representation.num_rows
         most = self._max_bytes if rows is None else min(self._max_bytes, _ROWS_BYTES)
         at_once = max(1, most // (radiance_bytes * light.dtype.itemsize))
@@ -95,6 +102,7 @@ class Relighter(nn.Module):
         transferred: Float[Tensor, "batch points rows rgb"],
         views: Float[Tensor, "views *points 3"] | None = None,
         frames: Float[Tensor, "points 3 3"] | None = None,
+        positions: Float[Tensor, "points 3"] | None = None,
     ) -> Float[Tensor, "batch views points rgb"]:
         """Radiance of what :meth:`transferred` gave: a change of view costs only this.
 
@@ -102,11 +110,12 @@ class Relighter(nn.Module):
             transferred: Of a batch of lights.
             views: As in :meth:`forward`.
             frames: Shading frames of a deformed surface.
+            positions: Where its points are.
 
         Raises:
             ValueError: If views are needed and not given.
         """
-        rows = self._view_rows(views, frames)
+        rows = self._view_rows(views, frames, positions)
         return self._shade(transferred, rows, own=rows is not None)
 
     def _shade(self, radiance: Tensor, rows: Tensor | None, *, own: bool) -> Tensor:
@@ -119,7 +128,7 @@ class Relighter(nn.Module):
         return radiance.mul_(reflectance) if own and not tracked else radiance * reflectance
 
     def _view_rows(
-        self, views: Tensor | None, frames: Tensor | None
+        self, views: Tensor | None, frames: Tensor | None, positions: Tensor | None
     ) -> Float[Tensor, "views points rows"] | Float[Tensor, "views points rows rgb"] | None:
         """The exit basis at each view; None where radiance does not depend on it."""
         surface = self.representation.surface
@@ -131,12 +140,30 @@ class Relighter(nn.Module):
         if frames is None:
             raise ValueError("this transfer has no shading frames to take views into")
         if views.ndim == 2:
-            if surface.positions is None:
+            positions = surface.positions if positions is None else positions
+            if positions is None:
                 raise ValueError('this transfer has no positions; give views "views points 3"')
-            views = views[:, None] - surface.positions.to(views)
+            views = views[:, None] - positions.to(views)
             views = torch.nn.functional.normalize(views, dim=-1)
         local = torch.einsum("pij,vpj->vpi", frames.to(views), views)
         return surface.exit_basis.evaluate(local)
+
+
+def _sequence(
+    light: Tensor, frames: Tensor, positions: Tensor | None
+) -> list[tuple[Tensor, Tensor, Tensor | None]]:
+    """The light, the frames and the positions of each pose; what there is one of serves all."""
+    count = max(len(light), len(frames))
+    if {len(light), len(frames)} - {1, count}:
+        raise ValueError(
+            f"expected as many poses as lights, or one, got {len(frames)} and {len(light)}"
+        )
+    lights = light.expand(count, *light.shape[1:]).split(1)
+    poses = frames.expand(count, *frames.shape[1:])
+    if positions is None or positions.ndim == 2:
+        return [(lit, pose, positions) for lit, pose in zip(lights, poses, strict=True)]
+    where = positions.expand(count, *positions.shape[1:])
+    return list(zip(lights, poses, where, strict=True))
 
 
 def _towards(

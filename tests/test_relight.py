@@ -1,5 +1,7 @@
 """Relighting and evaluation, against the definition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from prt_torch import evaluate
 from prt_torch.assets import find_environment
 from prt_torch.bases import ExitBasis, SphericalHarmonics
 from prt_torch.relight import Relighter
-from prt_torch.representations import CPCA, DenseTransfer
+from prt_torch.representations import CPCA, DenseTransfer, ZonalLobes
 from prt_torch.sphere import frame_from_normal
 from prt_torch.transfer import TransferTensor
 
@@ -199,3 +201,28 @@ def test_median_seconds_takes_functions_in_turn():
     assert order == ["a", "b"] * 3
     assert len(times) == 2
     assert all(t >= 0 for t in times)
+
+
+def test_a_sequence_of_poses_with_views():
+    from_harmonics = replace(glossy().surface, light_basis=SphericalHarmonics(3))
+    transfer = replace(glossy(), surface=from_harmonics)
+    relight = Relighter(ZonalLobes.from_transfer(transfer, num_lobes=3, effort="fast", bits=None))
+    generator = torch.Generator().manual_seed(3)
+    turn = frame_from_normal(torch.tensor([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]], dtype=torch.float64))
+    rest, positions = transfer.surface.frames, transfer.surface.positions
+    assert rest is not None
+    assert positions is not None
+    frames, where = rest @ turn.mT[:, None], positions @ turn.mT
+    light = torch.randn(1, 9, 3, generator=generator, dtype=torch.float64)
+    eyes = torch.tensor([[3.0, 1, 0], [0, 5, 2]], dtype=torch.float64)
+    sequence = relight(light, eyes, frames, where)
+    each = [relight(light, eyes, frames[b], where[b]) for b in range(2)]
+    assert torch.equal(sequence, torch.cat(each))
+    # Turning surface, light and viewer together changes nothing.
+    basis = SphericalHarmonics(3)
+    for b in range(2):
+        turned = basis.rotate(light, turn[b])
+        seen = relight(turned, eyes @ turn[b].mT, frames[b], where[b])
+        assert relative(seen, relight(light, eyes)) < 1e-10
+    with pytest.raises(ValueError, match="as many poses as lights"):
+        relight(light.expand(3, -1, -1), eyes, frames)

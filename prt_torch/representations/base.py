@@ -69,7 +69,8 @@ class Representation(nn.Module, ABC):
         Args:
             light: Light coefficients ``"batch coeffs rgb"``, or ``"batch points coeffs rgb"``
                 where each point has its own light.
-            frames: Poses of a deformed surface, ``"points 3 3"``.
+            frames: Shading frames of a deformed surface: one pose ``"points 3 3"`` for all lights,
+                or ``"batch points 3 3"``, a pose for each light. A single light serves all poses.
 
         Raises:
             ValueError: If shapes do not fit, or the representation cannot be posed.
@@ -126,6 +127,29 @@ class Representation(nn.Module, ABC):
                 f'"batch {self.num_points} {self.num_coeffs} 3", got {tuple(light.shape)}'
             )
         return local
+
+    def _poses(
+        self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor
+    ) -> list[tuple[Float[Tensor, "some *points coeffs rgb"], Float[Tensor, "points 3 3"]]]:
+        """Lights with the rotations, one for each point, from the rest pose to the pose they light.
+
+        Raises:
+            ValueError: If shapes do not fit, or the surface has no frames at rest.
+        """
+        if frames.ndim not in (3, 4) or frames.shape[-3:] != (self.num_points, 3, 3):
+            raise ValueError(
+                f'expected frames "{self.num_points} 3 3" or "batch {self.num_points} 3 3", '
+                f"got {tuple(frames.shape)}"
+            )
+        rest = self._surface.frames
+        if rest is None:
+            raise ValueError("expected a surface with frames at rest to be posed by others")
+        turns = frames.mT @ rest.to(frames)
+        if turns.ndim == 3 or len(turns) == 1:
+            return [(light, turns.view(-1, 3, 3))]
+        if len(light) not in (1, len(turns)):
+            raise ValueError(f"expected 1 light or {len(turns)}, one a pose, got {len(light)}")
+        return list(zip(light.expand(len(turns), *light.shape[1:]).split(1), turns, strict=True))
 
 
 class CodedRepresentation(Representation):

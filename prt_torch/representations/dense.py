@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from prt_torch.bases import SphericalHarmonics, sh_zxzxz
 from prt_torch.metric import Metric
 from prt_torch.quantize import dequantize, full_scale, quantize, rounded_up
 from prt_torch.representations.base import Representation
@@ -70,13 +71,25 @@ class DenseTransfer(Representation):
     def forward(
         self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
     ) -> Float[Tensor, "batch points rows rgb"]:
-        """Transfer times light.
+        """Transfer times light, which is turned into the rest pose where the surface is posed.
 
         Raises:
-            ValueError: If shapes do not fit, or ``frames`` are given.
+            ValueError: If shapes do not fit, or ``frames`` are given of transfer that is not in
+                spherical harmonics, or of a surface without frames at rest.
         """
-        if frames is not None:
-            raise ValueError("dense transfer is fixed to the rest pose and cannot be posed")
+        if frames is None:
+            return self._lit(light)
+        self._check_light(light)
+        basis = self._surface.light_basis
+        if not isinstance(basis, SphericalHarmonics):
+            raise ValueError("dense transfer can be posed in spherical harmonics only")
+        poses = [self._lit(_turned_back(some, turns)) for some, turns in self._poses(light, frames)]
+        return torch.cat(poses) if len(poses) > 1 else poses[0]
+
+    def _lit(
+        self, light: Float[Tensor, "batch *points coeffs rgb"]
+    ) -> Float[Tensor, "batch points rows rgb"]:
+        """Radiance in the rest pose."""
         if self._check_light(light):
             equation = "pcri,bpic->bprc" if self.num_channels == 3 else "pzri,bpic->bprc"
             return torch.einsum(equation, self.values, light)
@@ -116,3 +129,12 @@ class DenseTransfer(Representation):
     def condition(self) -> float:
         """1: nothing was solved."""
         return 1.0
+
+
+def _turned_back(
+    light: Float[Tensor, "batch *points coeffs rgb"], turns: Float[Tensor, "points 3 3"]
+) -> Float[Tensor, "batch points coeffs rgb"]:
+    """Light as each point sees it that has been turned."""
+    by_point = light if light.ndim == 4 else light[:, None].expand(-1, len(turns), -1, -1)
+    back = turns.mT[None, :, None].to(light)
+    return sh_zxzxz.rotate(by_point.mT, back.expand(len(light), -1, 3, -1, -1)).mT

@@ -30,17 +30,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from prt_torch.bases import SphericalHarmonics, sh, zonal
+from prt_torch.bases import SphericalHarmonics, zonal
 from prt_torch.metric import Metric
 from prt_torch.representations.base import CodedRepresentation
 from prt_torch.representations.zonal_lobes_coding import BITS, Lobes, on_codes, pack, unpack
 from prt_torch.representations.zonal_lobes_search import Effort, search
+from prt_torch.representations.zonal_lobes_shading import radiance, turned
 from prt_torch.transfer import Surface, TransferTensor
 
 LINEAR_LOBES = 3
 """Lobes from which on constant and linear terms are kept beside them."""
-
-_BLOCK_BYTES = 2**25  # of light at lobes, of points that are relit at once
 
 
 class ZonalLobes(CodedRepresentation):
@@ -188,6 +187,7 @@ class ZonalLobes(CodedRepresentation):
             light: In world coordinates.
             frames: Shading frames of the deformed surface, rows tangent, bitangent and normal: what
                 points the same way in a point's frame as at rest is what its transfer turns to.
+                One pose ``"points 3 3"``, or ``"batch points 3 3"`` with one for each light.
 
         Raises:
             ValueError: If shapes do not fit, or ``frames`` are given and the surface has none to
@@ -196,68 +196,19 @@ class ZonalLobes(CodedRepresentation):
         Source:
             Sloan, Luna, Snyder 2005, equations 10, 24 and 25.
         """
-        local = self._check_light(light)
-        coloured = self._by_channel(light, local)
-        lobes, turns = self._values(), self._turns(frames)
-        count = len(coloured) * self.axes.shape[1] * self.num_lobes
-        step = max(1, _BLOCK_BYTES // (count * light.element_size()))
-        pieces = []
-        for first in range(0, self.num_points, step):
-            some = slice(first, first + step)
-            own = Lobes(*(getattr(lobes, name)[some] for name in Lobes.names()))
-            turn = None if turns is None else turns[some]
-            lit = coloured[:, :, some] if local else coloured
-            pieces.append(self._relit(own, lit, turn))
-        radiance = torch.cat(pieces, dim=1) if len(pieces) > 1 else pieces[0]
-        by_colour = radiance.unflatten(0, (len(light), -1)).permute(0, 2, 4, 1, 3)
-        return by_colour.flatten(3)
-
-    def _by_channel(
-        self, light: Tensor, local: bool
-    ) -> Float[Tensor, "lights channels points_or_one coeffs"]:
-        """One light for each colour where channels are shared, else one colour a channel."""
-        by_point = light if local else light[:, None]
-        colours = by_point.permute(0, 3, 1, 2)  # batch rgb points coeffs
-        return colours.flatten(0, 1)[:, None] if self.num_channels == 1 else colours
-
-    def _turns(self, frames: Tensor | None) -> Float[Tensor, "points 3 3"] | None:
-        """Rotations from the rest pose to another one."""
+        self._check_light(light)
+        lobes = self._values()
         if frames is None:
-            return None
-        if frames.shape != (self.num_points, 3, 3):
-            raise ValueError(f'expected frames "{self.num_points} 3 3", got {tuple(frames.shape)}')
-        rest = self._surface.frames
-        if rest is None:
-            raise ValueError("expected a surface with frames at rest to be posed by others")
-        return frames.mT @ rest.to(frames)
-
-    def _relit(
-        self,
-        lobes: Lobes,
-        light: Float[Tensor, "lights channels points_or_one coeffs"],
-        turns: Float[Tensor, "points 3 3"] | None,
-    ) -> Float[Tensor, "lights points channels rows"]:
-        """Radiance of some points."""
-        axes, linear = zonal.unit_axes(lobes.axes), lobes.linear
-        if turns is not None:
-            axes = torch.einsum("pij,prnj->prni", turns, axes)
-            linear = _turned(linear, turns)
-        split = (self.num_channels, self.num_rows)
-        harmonics = sh.evaluate(axes, self.order).unflatten(1, split)
-        weights = lobes.coefficients.unflatten(1, split)
-        low = linear.shape[-1]
-        total = _met(linear.unflatten(1, split)[:, :, :, None], light[..., :low])[..., 0]
-        for index, band in enumerate(range(self.first_band, self.order)):
-            own = slice(band * band, (band + 1) ** 2)
-            at_axes = _met(harmonics[..., own], light[..., own])
-            total = total + torch.einsum("qpcrn,pcrn->qpcr", at_axes, weights[..., index])
-        return total
+            return radiance(lobes, light, self.num_channels)
+        poses = [
+            radiance(turned(lobes, turns), lit, self.num_channels)
+            for lit, turns in self._poses(light, frames)
+        ]
+        return torch.cat(poses) if len(poses) > 1 else poses[0]
 
     def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
         """Sums of the lobes' harmonics, in the rest pose."""
-        lobes = self._values()
-        if points is not None:
-            lobes = Lobes(*(getattr(lobes, name)[points] for name in Lobes.names()))
+        lobes = self._values() if points is None else self._values()[points]
         filled = nn.functional.pad(lobes.coefficients, (self.first_band, 0))
         harmonics = zonal.lobes_to_sh(lobes.axes, filled)
         low = lobes.linear.shape[-1]
@@ -335,24 +286,3 @@ def _worst_condition(lobes: Lobes, order: int, ridge: float) -> float:
 
 def _largest(coefficients: Tensor) -> float:
     return float(coefficients.abs().max()) if coefficients.numel() else 0.0
-
-
-def _turned(
-    linear: Float[Tensor, "points rows low"], turns: Float[Tensor, "points 3 3"]
-) -> Float[Tensor, "points rows low"]:
-    """Constant and linear terms after a turn; linear ones are a vector, in the order y, z, x."""
-    if linear.shape[-1] < 4:
-        return linear
-    constant, y, z, x = linear.unbind(-1)
-    x, y, z = torch.einsum("pij,prj->ipr", turns, torch.stack([x, y, z], dim=-1))
-    return torch.stack([constant, y, z, x], dim=-1)
-
-
-def _met(
-    functions: Float[Tensor, "points channels rows lobes some"],
-    light: Float[Tensor, "lights channels points_or_one some"],
-) -> Float[Tensor, "lights points channels rows lobes"]:
-    """Light at each of the functions, of each point its own light or the same."""
-    if light.shape[2] == 1:
-        return torch.einsum("pcrnm,qcm->qpcrn", functions, light[:, :, 0])
-    return torch.einsum("pcrnm,qcpm->qpcrn", functions, light)

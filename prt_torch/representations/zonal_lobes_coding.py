@@ -34,6 +34,10 @@ class Lobes:
     coefficients: Float[Tensor, "points rows lobes bands"]
     linear: Float[Tensor, "points rows low"]
 
+    def __getitem__(self, points: slice | Tensor, /) -> "Lobes":
+        """Those of some points."""
+        return Lobes(self.axes[points], self.coefficients[points], self.linear[points])
+
     @classmethod
     def names(cls) -> list[str]:
         """Of the three parts."""
