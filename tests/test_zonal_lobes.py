@@ -10,6 +10,7 @@ from contract import Contract, random_transfer, relative
 from torch import nn
 
 from prt_torch.bases import CubeDirections, SphericalHarmonics, sh, zonal
+from prt_torch.bases.zonal_table import LatLongTable
 from prt_torch.fitting import fit
 from prt_torch.representations import DenseTransfer, ZonalLobes, load, save
 from prt_torch.representations.zonal_lobes_descent import descend
@@ -398,3 +399,26 @@ def test_dense_transfer_is_posed_by_turning_light_back(local):
     equation = "pri,bpic->bprc" if local else "pri,bic->bprc"
     expected = torch.einsum(equation, turned[:, 0], light)
     assert relative(dense(light, frames), expected) < 1e-10
+
+
+@pytest.mark.parametrize(("channels", "rows"), [(1, 2), (3, 2)])
+@pytest.mark.parametrize("lobes", [1, 4])
+@pytest.mark.parametrize("local", [False, True])
+def test_tables_come_close_to_exact_evaluation(lobes, channels, rows, local):
+    model, frames = posed(lobes, channels, rows)
+    points = (20,) if local else ()
+    light = torch.randn(2, *points, ORDER**2, 3, dtype=torch.float64)
+    exact = model(light, frames)
+    errors = []
+    for size in (16, 256):
+        model.table = LatLongTable(size, 2 * size)
+        errors.append(relative(model(light, frames), exact))
+    assert 5e-3 < errors[0] < 0.3
+    assert errors[1] < 2e-3  # 17 times as fine, and quadratic
+
+
+def test_light_has_gradients_through_a_table():
+    model, _ = posed(4)
+    model.table = LatLongTable()
+    light = torch.randn(1, ORDER**2, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(model, light)

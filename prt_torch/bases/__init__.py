@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from prt_torch.bases import haar, sh, sh_zxzxz, srbf, zonal
+from prt_torch.bases import haar, sh, sh_zxzxz, srbf, zonal, zonal_table
 from prt_torch.bases.base import ExitBasis, LightBasis, Radiance
 from prt_torch.bases.brdf_error import FactorError, factor_error
 from prt_torch.bases.brdf_factors import BRDFFactors
@@ -44,6 +44,7 @@ __all__ = [
     "sh_zxzxz",
     "srbf",
     "zonal",
+    "zonal_table",
 ]
 
 TexelBasis = CubeDirections | Haar | SRBF

@@ -18,8 +18,8 @@ The turn carries what happens near the point, such as the shadow of a bump, and 
 happens far away, whose shadow would not move with the point.
 
 Source:
-    Sloan, Luna, Snyder 2005, sections 3.1, 3.2, 4.1 and 5. Light is exact at every axis: the paper
-    looks it up in a table of 64 x 32 directions.
+    Sloan, Luna, Snyder 2005, sections 3.1, 3.2, 4.1 and 5. Light is exact at every axis unless a
+    ``table`` is set; the paper always looks it up, in 64 x 32 directions.
 """
 
 import math
@@ -31,6 +31,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from prt_torch.bases import SphericalHarmonics, zonal
+from prt_torch.bases.zonal_table import LatLongTable
 from prt_torch.metric import Metric
 from prt_torch.representations.base import CodedRepresentation
 from prt_torch.representations.zonal_lobes_coding import BITS, Lobes, on_codes, pack, unpack
@@ -58,6 +59,8 @@ class ZonalLobes(CodedRepresentation):
         shape: Points, channels, rows, coeffs.
 
     Attributes:
+        table: Size of the table that light at the axes is looked up in; None, at first, for exact
+            evaluation. May be set at any time; belongs to nothing that is saved.
         bits: Of a code; None where parameters are kept as they are.
         statistics: ``largest_coefficient`` (of g*), ``starts``, ``steps`` (evaluations),
             ``unfinished`` (fits that were ended by the limit of steps), ``seconds``; empty if
@@ -83,6 +86,7 @@ class ZonalLobes(CodedRepresentation):
         super().__init__(surface, shape)
         self.order = _order(surface, shape[3])
         self.bits: Literal[16] | None = None if steps is None else BITS
+        self.table: LatLongTable | None = None
         self.statistics: dict[str, float] = {}
         self._condition = float("nan")
         for name in Lobes.names():
@@ -199,9 +203,9 @@ class ZonalLobes(CodedRepresentation):
         self._check_light(light)
         lobes = self._values()
         if frames is None:
-            return radiance(lobes, light, self.num_channels)
+            return radiance(lobes, light, self.num_channels, self.table)
         poses = [
-            radiance(turned(lobes, turns), lit, self.num_channels)
+            radiance(turned(lobes, turns), lit, self.num_channels, self.table)
             for lit, turns in self._poses(light, frames)
         ]
         return torch.cat(poses) if len(poses) > 1 else poses[0]
