@@ -14,14 +14,21 @@ from prt_torch import bases, representations, sphere
 from prt_torch.assets import (
     Environment,
     Mesh,
+    SkinnedMesh,
+    bend,
     concatenate,
+    deformed,
+    deformed_frames,
     find_environment,
     ground_plane,
     load_environment,
     load_mesh,
+    load_skinned,
     procedural_scene,
+    twist,
 )
-from prt_torch.baking import bake
+from prt_torch.assets.tangents import frames_on_faces, tangent_frames
+from prt_torch.baking import bake, bake_patch
 from prt_torch.errors import InputError
 from prt_torch.fitting import FitResult, fit
 from prt_torch.metric import Metric
@@ -38,19 +45,28 @@ __all__ = [
     "Mesh",
     "Metric",
     "Relighter",
+    "SkinnedMesh",
     "Surface",
     "TransferTensor",
     "bake",
+    "bake_patch",
     "bases",
+    "bend",
     "concatenate",
+    "deformed",
+    "deformed_frames",
     "find_environment",
     "fit",
+    "frames_on_faces",
     "ground_plane",
     "load",
     "load_environment",
     "load_mesh",
+    "load_skinned",
     "procedural_scene",
     "representations",
     "save",
     "sphere",
+    "tangent_frames",
+    "twist",
 ]

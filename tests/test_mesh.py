@@ -609,6 +609,11 @@ BAD_FILES = {
         glb_bytes(*gltf_document(faces=np.where(CUBE_FACES == 7, 9, CUBE_FACES))),
         r"accessors\[1\]: \d+ indices are out of range, the first is 9 at \d+, of 8 vertices",
     ),
+    "texture.obj": (
+        obj_text() + "vt 0 0\nf 1/1 2/2 3/1\n",
+        "line 16: texture coordinate 2 does not exist .1 so far",
+    ),
+    "vt.obj": (obj_text() + "vt\n", "texture coordinates need at least 1 number"),
     "sparse.glb": (changed(["accessors", 0, "sparse"], {}), "sparse"),
     "mesh.blend": ("x", "unknown mesh format"),
 }
@@ -730,6 +735,98 @@ def test_real_mesh(assets, name):
     assert {tuple(sorted(f)) for f in mesh.faces.tolist()} == {
         tuple(sorted(f)) for f in other.faces.tolist()
     }
+
+
+CORNER_UV = np.random.default_rng(7).uniform(-0.5, 1.5, (8, 2))
+
+
+class TestTextureCoordinates:
+    def obj(self, corners=CUBE_QUADS, start=""):
+        lines = [f"vt {u!r} {v!r}" for u, v in CORNER_UV.tolist()]
+        faces = [
+            "f " + " ".join(f"{i + 1}/{(i + k) % 8 + 1}" for i in q) for k, q in enumerate(corners)
+        ]
+        return start + obj_text(polygons=[]) + "\n".join([*lines, *faces, ""])
+
+    def expected(self):
+        quads = np.stack([CORNER_UV[(quad + k) % 8] for k, quad in enumerate(CUBE_QUADS)])
+        return np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], axis=1).reshape(-1, 3, 2)
+
+    def test_obj_seams_split_no_point(self, tmp_path):
+        mesh = load_mesh(write(tmp_path, "a.obj", self.obj()))
+        assert mesh.num_points == 8
+        np.testing.assert_array_equal(mesh.uv, self.expected())
+
+    def test_they_stay_at_their_corners_under_flips_and_mirrors(self, tmp_path):
+        path = write(tmp_path, "a.obj", self.obj())
+        plain = load_mesh(path)
+        at = {
+            tuple(point): coordinates
+            for face, uv in zip(plain.faces.tolist(), plain.uv.tolist(), strict=True)
+            for point, coordinates in zip([(f, tuple(face)) for f in face], uv, strict=True)
+        }
+        mirror = np.diag([-1.0, 1, 1, 1]).tolist()
+        for options in ({"orientation": "flip"}, {"transform": mirror}):
+            mesh = load_mesh(path, **options)
+            assert not torch.equal(mesh.faces, plain.faces)
+            for face, uv in zip(mesh.faces.tolist(), mesh.uv.tolist(), strict=True):
+                winding = (face[0], face[2], face[1])
+                assert [at[(f, winding)] for f in face] == uv
+
+    def test_faces_that_lack_one_have_none_and_are_counted(self, tmp_path):
+        text = self.obj().replace("f 1/1 ", "f 1 ")
+        mesh = load_mesh(write(tmp_path, "a.obj", text))
+        assert mesh.uv is not None
+        expected = self.expected()
+        expected[:2] = np.nan
+        np.testing.assert_array_equal(mesh.uv, expected)
+        assert names(mesh) == {"missing_uv": 2}
+        text = text.replace(f"vt {CORNER_UV[5, 0].item()!r}", "vt nan")
+        assert names(load_mesh(write(tmp_path, "b.obj", text)))["missing_uv"] > 2
+        assert load_mesh(write(tmp_path, "c.obj", obj_text())).uv is None
+
+    @pytest.mark.parametrize("properties", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
+    def test_ply_vertices(self, tmp_path, properties):
+        head, body = ply_bytes(polygons=CUBE_QUADS.tolist()).decode().split("end_header\n")
+        u, v = properties
+        head = head.replace("double z\n", f"double z\nproperty float {u}\nproperty float {v}\n")
+        rows = body.splitlines()
+        rows[:8] = [f"{row} {u} {v}" for row, (u, v) in zip(rows[:8], CORNER_UV, strict=True)]
+        text = head + "end_header\n" + "\n".join(rows) + "\n"
+        mesh = load_mesh(write(tmp_path, "a.ply", text))
+        np.testing.assert_array_equal(mesh.uv, CORNER_UV[mesh.faces])
+
+    def test_gltf_runs_down_and_primitives_keep_their_own(self, tmp_path):
+        document, binary = gltf_document(faces=CUBE_FACES[:4])
+        rest = np.asarray(CUBE_FACES[4:], "<u2")
+        attribute = {"componentType": 5123, "count": rest.size, "type": "SCALAR"}
+        binary = add_accessor(document, binary, rest, attribute)
+        codes = np.rint(CORNER_UV.clip(0, 1) * 65535).astype("<u2")
+        attribute = {"componentType": 5123, "count": 8, "type": "VEC2", "normalized": True}
+        binary = add_accessor(document, binary, codes, attribute)
+        first = document["meshes"][0]["primitives"][0]
+        attributes = {**first["attributes"], "TEXCOORD_0": 3}
+        document["meshes"][0]["primitives"].append({"attributes": attributes, "indices": 2})
+        document["nodes"][0]["scale"] = [1, -1, 1]
+        mesh = load_mesh(write(tmp_path, "a.glb", glb_bytes(document, binary)))
+        assert mesh.num_points == 8
+        assert torch.isnan(mesh.uv[:4]).all()
+        expected = (codes / 65535 * [1, -1] + [0, 1])[mesh.faces[4:]]
+        np.testing.assert_allclose(mesh.uv[4:], expected, atol=1e-15)
+
+    def test_arrays_and_joining(self):
+        faces = torch.tensor(CUBE_FACES)
+        uv = torch.rand(12, 3, 2, dtype=torch.float64)
+        with_uv = mesh_from_arrays("a", torch.tensor(CUBE_VERTICES), faces, uv=uv)
+        assert torch.equal(with_uv.uv, uv)
+        both = concatenate([cube(), with_uv], "both")
+        assert torch.isnan(both.uv[:12]).all()
+        assert torch.equal(both.uv[12:], uv)
+        assert concatenate([cube(), cube()], "none").uv is None
+        with pytest.raises(
+            ValueError, match=r"expected uv of shape \(12, 3, 2\), got \(11, 3, 2\)"
+        ):
+            mesh_from_arrays("a", torch.tensor(CUBE_VERTICES), faces, uv=uv[1:])
 
 
 class TestGroupsOfAnOBJ:

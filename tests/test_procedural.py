@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from prt_torch.assets import ground_plane, mesh_from_arrays, procedural_scene
+from prt_torch.assets.procedural import grid_surface, surface_of_revolution
 from prt_torch.errors import InputError
 
 
@@ -90,3 +91,35 @@ def test_ground_scales_with_the_mesh(scale):
 def test_ground_options_are_checked(option):
     with pytest.raises(InputError, match=f"ground.{next(iter(option))}="):
         ground_plane(triangle([[1.0, 2, 3], [5, 2, 4], [1, 9, 3]]), **option)
+
+
+def test_texture_coordinates_of_a_cylinder_are_its_angle_and_height():
+    """As an image lies on it: u to the right of who looks at its front, v up, outside outside."""
+    height = torch.linspace(3.0, 1.0, 5, dtype=torch.float64)
+    profile = torch.stack([torch.full_like(height, 2.0), height], dim=-1)
+    cylinder = surface_of_revolution("cylinder", profile, 16, repeats=(4.0, 3.0))
+    assert cylinder.num_points == 5 * 16  # its seam has no points of its own
+    assert cylinder.uv is not None
+    corners = cylinder.vertices[cylinder.faces]
+    angle = torch.atan2(corners[..., 0], corners[..., 2]) / (2 * math.pi)
+    off = cylinder.uv[..., 0] / 4.0 - angle
+    np.testing.assert_allclose(off, off.round(), atol=1e-12)
+    np.testing.assert_allclose(cylinder.uv[..., 1], 3.0 * (corners[..., 1] - 1.0) / 2.0, atol=1e-12)
+    assert float(cylinder.uv[..., 0].diff(dim=1).abs().max()) < 4.0 / 16 + 1e-12
+    outward = (cylinder.normals * cylinder.vertices * torch.tensor([1.0, 0.0, 1.0])).sum(-1)
+    assert float(outward.min()) > 1.99
+
+
+def test_vase_has_a_seamless_texture():
+    vase = procedural_scene("vase")
+    assert vase.uv is not None
+    assert vase.warnings == ()
+    np.testing.assert_array_equal(vase.uv.amax((0, 1)), [8.0, 8.0])
+
+
+@pytest.mark.parametrize("shape", [(1, 4), (4, 1)])
+def test_a_surface_needs_rows_and_columns(shape):
+    with pytest.raises(InputError, match="sheet: expected a grid of at least 2 x 2"):
+        grid_surface("sheet", torch.zeros(*shape, 3, dtype=torch.float64))
+    with pytest.raises(InputError, match="at least 3 columns"):
+        surface_of_revolution("tube", torch.ones(4, 2, dtype=torch.float64), 2)

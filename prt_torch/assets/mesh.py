@@ -17,40 +17,24 @@ from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
 from prt_torch.assets.input_file import read_input
+from prt_torch.assets.mesh_checks import (
+    MeshWarning,
+    checked_albedo,
+    checked_faces,
+    checked_uv,
+    counted_warnings,
+)
 from prt_torch.assets.mesh_formats import READERS, RawMesh, finite_normals
 from prt_torch.assets.mesh_geometry import (
     connectivity,
     face_geometry,
-    fan_triangles,
     normalised,
     placement,
     transform_mesh,
+    turned_over,
     vertex_normals,
 )
 from prt_torch.errors import InputError
-
-DEFAULT_ALBEDO = (0.8, 0.8, 0.8)
-"""Linear albedo of points whose file gives no colour."""
-
-# Far beyond any length in use, and its cube is still a float64.
-_MAX_COORDINATE = 1e100
-
-_MESSAGES = {
-    "isolated_vertices": "{count} vertices belong to no face; they stay, black, in their place",
-    "undefined_normals": "{count} vertices have faces but no normal (zero area or cancelling "
-    "faces); they stay, black, in their place",
-    "zero_area_faces": "{count} faces have no area; they block no light and weigh in no normal",
-    "duplicate_faces": "{count} faces repeat another face; they only cost time",
-    "open_boundary": "{count} edges have one face; the surface is open, and its back is black",
-    "non_manifold_edges": "{count} edges join more than two faces; normals there are averages",
-    "recomputed_normals": "{count} normals in the file are zero or not finite; computed from faces",
-    "split_normals": "{count} vertices have several normals in the file; computed from faces",
-    "opposed_normals": "{count} normals in the file point behind their faces; points there may be "
-    "black",
-    "inward_normals": "{count} faces point inwards, so all points will be black; "
-    "set scene.orientation=flip",
-    "flipped": "{count} faces pointed inwards and were turned outwards",
-}
 
 
 @dataclass(frozen=True)
@@ -65,15 +49,6 @@ class Part:
     num_vertices: int
     first_face: int
     num_faces: int
-
-
-@dataclass(frozen=True)
-class MeshWarning:
-    """A defect that a mesh can be baked with, how often it occurs, and what follows from it."""
-
-    name: str
-    count: int
-    message: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +71,10 @@ class Mesh:
     parts: tuple[Part, ...]
     """Parts in file order; one part where the file knows none."""
     warnings: tuple[MeshWarning, ...]
-    """Defects found, in the order of this module's table of messages."""
+    """Defects found, in a fixed order."""
+    uv: Float64[Tensor, "faces 3 2"] | None = None
+    """Texture coordinates of face corners, so that a seam splits no point; u to the right and v up,
+    (0, 0) at the bottom left of an image. NaN at faces that have none; None where no face has."""
 
     @property
     def num_points(self) -> int:
@@ -121,63 +99,6 @@ class Mesh:
         return float((high - low).norm())
 
 
-def _warnings(counts: dict[str, int]) -> tuple[MeshWarning, ...]:
-    """Warnings of all names that occurred."""
-    return tuple(
-        MeshWarning(name, count, message.format(count=count))
-        for name, message in _MESSAGES.items()
-        if (count := counts.get(name, 0))
-    )
-
-
-def _checked_faces(source: str, raw: RawMesh) -> Int64[np.ndarray, "faces 3"]:
-    """Triangles, after every number and index of the mesh has been found usable."""
-    num_points, base = len(raw.vertices), raw.first_index
-    if not num_points:
-        raise InputError(f"{source}: has no vertices")
-    if not len(raw.sizes):
-        raise InputError(f"{source}: has no faces; a point cloud has no surface to bake")
-    finite = np.isfinite(raw.vertices).all(axis=1)
-    if not finite.all():
-        raise InputError(
-            f"{source}: {num_points - finite.sum()} of {num_points} vertices are not finite, "
-            f"the first is vertex {finite.argmin() + base}"
-        )
-    if (largest := np.abs(raw.vertices).max()) > _MAX_COORDINATE:
-        raise InputError(f"{source}: coordinate {largest:.3g} is beyond {_MAX_COORDINATE:.0e}")
-    if (raw.sizes < 3).any():
-        first = int((raw.sizes < 3).argmax())
-        raise InputError(
-            f"{source}: {(raw.sizes < 3).sum()} faces have fewer than 3 corners, "
-            f"the first is face {first + base}"
-        )
-    wrong = (raw.corners < 0) | (raw.corners >= num_points)
-    if wrong.any():
-        corner = int(wrong.argmax())
-        face = int(np.searchsorted(np.cumsum(raw.sizes), corner, side="right"))
-        raise InputError(
-            f"{source}: {wrong.sum()} vertex indices of faces are out of range, the first is "
-            f"{raw.corners[corner] + base} in face {face + base} "
-            f"(vertices are {base} to {num_points - 1 + base})"
-        )
-    return fan_triangles(raw.corners, raw.sizes)
-
-
-def _checked_albedo(
-    source: str, albedo: Float64[np.ndarray, "points 3"]
-) -> Float64[np.ndarray, "points 3"]:
-    """Albedo with the default where there is none."""
-    albedo = np.where(np.isnan(albedo), DEFAULT_ALBEDO, albedo)
-    wrong = ((albedo < 0) | (albedo > 1)).any(axis=1)
-    if wrong.any():
-        first = int(wrong.argmax())
-        raise InputError(
-            f"{source}: {wrong.sum()} albedos lie outside 0 to 1, the first is "
-            f"{albedo[first].tolist()} at vertex {first} (counting from 0)"
-        )
-    return albedo
-
-
 def _choose_normals(
     given: Float64[np.ndarray, "points 3"] | None,
     computed: Float64[np.ndarray, "points 3"],
@@ -200,36 +121,79 @@ def _choose_normals(
     return chosen
 
 
-def _finish(
-    name: str,
-    source: str,
-    vertices: Float64[np.ndarray, "points 3"],
-    faces: Int64[np.ndarray, "faces 3"],
-    normals: Float64[np.ndarray, "points 3"] | None,
-    albedo: Float64[np.ndarray, "points 3"] | None,
-    parts: tuple[Part, ...],
-    orientation: Literal["file", "flip", "outward"],
-    split_normals: int,
-) -> Mesh:
-    """Orient the faces, choose normals and albedo, and count what is wrong."""
-    defects = connectivity(vertices, faces)
+def _parts(
+    name: str, raw: RawMesh, num_faces: int, offsets: Int64[np.ndarray, "ends"]
+) -> tuple[Part, ...]:
+    """Parts of the file by triangles, ``offsets[k]`` being the first of polygon k."""
+    if not raw.parts:
+        return (Part(name, 0, len(raw.vertices), 0, num_faces),)
+    return tuple(
+        Part(
+            part.name,
+            part.first_vertex,
+            part.num_vertices,
+            first := int(offsets[part.first_polygon]),
+            int(offsets[part.first_polygon + part.num_polygons]) - first,
+        )
+        for part in raw.parts
+    )
+
+
+def _flips(orientation: Literal["file", "flip", "outward"], side: int) -> bool:
+    """Whether faces are to be turned over."""
     match orientation:
         case "file":
-            flip = False
+            return False
         case "flip":
-            flip = True
+            return True
         case "outward":
-            flip = defects.side < 0
-        case _:
-            raise InputError(f"scene.orientation={orientation}: expected file, flip or outward")
+            return side < 0
+    raise InputError(f"scene.orientation={orientation}: expected file, flip or outward")
+
+
+def _turned_over(
+    faces: Int64[np.ndarray, "faces 3"], uv: Float64[np.ndarray, "faces 3 2"] | None
+) -> tuple[Int64[np.ndarray, "faces 3"], Float64[np.ndarray, "faces 3 2"] | None]:
+    return turned_over(faces), None if uv is None else turned_over(uv)
+
+
+def mesh_from_raw(
+    name: str,
+    source: str,
+    raw: RawMesh,
+    *,
+    matrix: Float64[np.ndarray, "4 4"] | None = None,
+    orientation: Literal["file", "flip", "outward"] = "file",
+    albedo: tuple[float, float, float] | None = None,
+) -> Mesh:
+    """Check what a reader returned, place it, orient its faces, choose normals and albedo.
+
+    Args:
+        name: What reports call the mesh.
+        source: What messages call it.
+        raw: As read.
+        matrix: Affine transform of all vertices.
+        orientation: As in :func:`load_mesh`.
+        albedo: Of all points, instead of the file's colours.
+
+    Raises:
+        InputError: As :func:`load_mesh`.
+    """
+    faces, uv = checked_faces(source, raw)
+    vertices, normals = raw.vertices, raw.normals
+    if matrix is not None:
+        vertices, normals, mirrored = transform_mesh(vertices, normals, matrix)
+        faces, uv = _turned_over(faces, uv) if mirrored else (faces, uv)
+    defects = connectivity(vertices, faces)
+    flip = _flips(orientation, defects.side)
     if flip:
-        faces = faces[:, [0, 2, 1]]
+        faces, uv = _turned_over(faces, uv)
         normals = None if normals is None else -normals
     side = -defects.side if flip else defects.side
     geometry = face_geometry(vertices, faces)
     used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
     counts = {
-        "split_normals": split_normals,
+        "split_normals": raw.split_normals,
         "zero_area_faces": int((geometry.normals == 0).all(axis=1).sum()),
         "duplicate_faces": defects.duplicate_faces,
         "open_boundary": defects.open_edges,
@@ -239,15 +203,20 @@ def _finish(
     }
     computed = vertex_normals(geometry, faces, len(vertices))
     chosen = _choose_normals(normals, computed, used, counts)
-    colour = np.full_like(vertices, np.nan) if albedo is None else albedo
+    uv = checked_uv(uv, counts)
+    colours = np.full_like(vertices, np.nan) if raw.albedo is None else raw.albedo
+    if albedo is not None:
+        source = "scene.albedo"
+        colours = np.broadcast_to(np.asarray(albedo, np.float64), vertices.shape)
     return Mesh(
         name=name,
         vertices=torch.from_numpy(np.ascontiguousarray(vertices)),
         faces=torch.from_numpy(np.ascontiguousarray(faces)),
         normals=torch.from_numpy(np.ascontiguousarray(chosen)),
-        albedo=torch.from_numpy(_checked_albedo(source, colour)),
-        parts=parts or (Part(name, 0, len(vertices), 0, len(faces)),),
-        warnings=_warnings(counts),
+        albedo=torch.from_numpy(checked_albedo(source, colours)),
+        parts=_parts(name, raw, len(faces), np.append(0, np.cumsum(raw.sizes - 2))),
+        warnings=counted_warnings(counts),
+        uv=None if uv is None else torch.from_numpy(np.ascontiguousarray(uv)),
     )
 
 
@@ -263,9 +232,10 @@ def load_mesh(
 
     Polygons become fans of triangles. Normals are the file's where a vertex has exactly one
     usable normal, and angle-weighted averages of its faces elsewhere. Vertex colours become the
-    albedo, sRGB-decoded but for glTF, whose colours are linear; a point without one gets
-    :data:`DEFAULT_ALBEDO`. STL facets share no points. The parts of a scene are its nodes,
-    those of an OBJ file its runs of one material, else of one group or object.
+    albedo, sRGB-decoded but for glTF, whose colours are linear; a point without one gets 0.8.
+    Texture coordinates are kept at corners of faces, v up (glTF's are turned). STL facets share no
+    points. The parts of a scene are its nodes, those of an OBJ file its runs of one material, else
+    of one group or object.
 
     Args:
         path: The file; its suffix names the format.
@@ -285,39 +255,17 @@ def load_mesh(
     if read is None:
         raise InputError(f"{path}: unknown mesh format, expected one of {', '.join(READERS)}")
     file, data = read_input(path, "mesh")
-    raw = read(file, data)
-    faces = _checked_faces(str(path), raw)
-    given = np.full_like(raw.vertices, np.nan) if raw.normals is None else raw.normals
-    matrix = placement(up, transform)
-    vertices, normals, faces = transform_mesh(raw.vertices, given, faces, matrix)
-    colours = raw.albedo
-    if albedo is not None:
-        colours = np.broadcast_to(np.asarray(albedo, np.float64), vertices.shape)
-    first_face = np.concatenate([[0], np.cumsum(raw.sizes - 2)])
-    parts = tuple(
-        Part(
-            part.name,
-            part.first_vertex,
-            part.num_vertices,
-            first := int(first_face[part.first_polygon]),
-            int(first_face[part.first_polygon + part.num_polygons]) - first,
-        )
-        for part in raw.parts
-    )
-    return _finish(
-        name=file.stem,
-        source=str(path) if albedo is None else "scene.albedo",
-        vertices=vertices,
-        faces=faces,
-        normals=None if raw.normals is None else normals,
-        albedo=colours,
-        parts=parts,
+    return mesh_from_raw(
+        file.stem,
+        str(path),
+        read(file, data),
+        matrix=placement(up, transform),
         orientation=orientation,
-        split_normals=raw.split_normals,
+        albedo=albedo,
     )
 
 
-def _numpy(tensor: Float[Tensor, "points 3"]) -> Float64[np.ndarray, "points 3"]:
+def _numpy(tensor: Float[Tensor, "*shape"]) -> Float64[np.ndarray, "*shape"]:
     """A copy, so that the mesh does not change with the caller's tensor."""
     return tensor.detach().cpu().double().numpy().copy()
 
@@ -329,6 +277,7 @@ def mesh_from_arrays(
     *,
     normals: Float[Tensor, "points 3"] | None = None,
     albedo: Float[Tensor, "points 3"] | None = None,
+    uv: Float[Tensor, "faces 3 2"] | None = None,
 ) -> Mesh:
     """A mesh from tensors, with the checks and defaults of :func:`load_mesh`.
 
@@ -337,29 +286,31 @@ def mesh_from_arrays(
         vertices: Positions in mesh units.
         faces: Zero-based vertices of each triangle, counter-clockwise from outside.
         normals: Normals of any length; angle-weighted averages of the faces by default.
-        albedo: Linear RGB in [0, 1]; :data:`DEFAULT_ALBEDO` by default.
+        albedo: Linear RGB in [0, 1]; :data:`~prt_torch.assets.DEFAULT_ALBEDO` if not given.
+        uv: Texture coordinates of face corners, v up; NaN at faces that have none.
 
     Raises:
         InputError: If a number is not finite, or an index or albedo is out of range.
+        ValueError: If texture coordinates do not fit the faces.
     """
-    points = _numpy(vertices)
+    if uv is not None and uv.shape != (len(faces), 3, 2):
+        raise ValueError(f"expected uv of shape {(len(faces), 3, 2)}, got {tuple(uv.shape)}")
     corners = faces.detach().cpu().long().reshape(-1).numpy()
-    raw = RawMesh(points, corners, np.full(len(corners) // 3, 3))
-    return _finish(
-        name=name,
-        source=name,
-        vertices=points,
-        faces=_checked_faces(name, raw),
+    raw = RawMesh(
+        vertices=_numpy(vertices),
+        corners=corners,
+        sizes=np.full(len(corners) // 3, 3),
         normals=None if normals is None else finite_normals(_numpy(normals)),
         albedo=None if albedo is None else _numpy(albedo),
-        parts=(),
-        orientation="file",
-        split_normals=0,
+        uv=None if uv is None else _numpy(uv).reshape(-1, 2),
     )
+    return mesh_from_raw(name, name, raw)
 
 
 def concatenate(meshes: Iterable[Mesh], name: str) -> Mesh:
     """Several meshes as one: points, faces and parts follow each other, warnings add up.
+
+    Faces of meshes without texture coordinates have NaN for them where others have some.
 
     Raises:
         ValueError: If there is no mesh.
@@ -392,5 +343,19 @@ def concatenate(meshes: Iterable[Mesh], name: str) -> Mesh:
         normals=torch.cat([mesh.normals for mesh in meshes]),
         albedo=torch.cat([mesh.albedo for mesh in meshes]),
         parts=tuple(parts),
-        warnings=_warnings(counts),
+        warnings=counted_warnings(counts),
+        uv=_joined_uv(meshes),
+    )
+
+
+def _joined_uv(meshes: tuple[Mesh, ...]) -> Float64[Tensor, "faces 3 2"] | None:
+    """Texture coordinates one after the other; None where no mesh has any."""
+    if all(mesh.uv is None for mesh in meshes):
+        return None
+    none = [mesh.vertices.new_full((mesh.num_faces, 3, 2), torch.nan) for mesh in meshes]
+    return torch.cat(
+        [
+            missing if mesh.uv is None else mesh.uv
+            for mesh, missing in zip(meshes, none, strict=True)
+        ]
     )

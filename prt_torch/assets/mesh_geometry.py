@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64, Shaped
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -36,23 +36,28 @@ def fan_triangles(
 
 def transform_mesh(
     vertices: Float64[np.ndarray, "points 3"],
-    normals: Float64[np.ndarray, "points 3"],
-    faces: Int64[np.ndarray, "faces 3"],
+    normals: Float64[np.ndarray, "points 3"] | None,
     matrix: Float64[np.ndarray, "4 4"],
-) -> tuple[
-    Float64[np.ndarray, "points 3"], Float64[np.ndarray, "points 3"], Int64[np.ndarray, "faces 3"]
-]:
-    """Apply an affine transform; a mirroring one reverses the winding, so sides stay sides.
+) -> tuple[Float64[np.ndarray, "points 3"], Float64[np.ndarray, "points 3"] | None, bool]:
+    """Apply an affine transform to vertices and normals, which come out unnormalised.
 
-    Normals turn with the cofactor matrix, and come out unnormalised.
+    The last result says whether it mirrors: then faces are to be turned over (:func:`turned_over`)
+    so that sides stay sides. Normals turn with the cofactor matrix, and point to the same side.
     """
     linear = matrix[:3, :3]
     a, b, c = linear
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
-    mirrored = np.linalg.det(linear) < 0
+    mirrored = bool(np.linalg.det(linear) < 0)
     moved = vertices @ linear.T + matrix[:3, 3]
-    turned = normals @ (-cofactors if mirrored else cofactors).T
-    return moved, turned, faces[:, [0, 2, 1]] if mirrored else faces
+    turned = None if normals is None else normals @ (-cofactors if mirrored else cofactors).T
+    return moved, turned, mirrored
+
+
+def turned_over(
+    corners: Shaped[np.ndarray, "faces 3 *rest"],
+) -> Shaped[np.ndarray, "faces 3 *rest"]:
+    """What belongs to the corners of faces, in the opposite winding."""
+    return corners[:, [0, 2, 1]]
 
 
 def placement(
@@ -172,14 +177,16 @@ def _distinct_rows(
     return ordered[starts], np.diff(np.append(starts, len(rows)))
 
 
-def _weld(vertices: Float64[np.ndarray, "points 3"]) -> Int64[np.ndarray, "points"]:
-    """A number for each vertex that it shares with all vertices at exactly its position."""
+def welded(
+    vertices: Float64[np.ndarray, "points width"],
+) -> Int64[np.ndarray, "points"]:
+    """A number for each row that it shares with all rows exactly like it."""
     order = np.lexsort(vertices.T)
     ordered = vertices[order]
     changes = np.append(False, (ordered[1:] != ordered[:-1]).any(axis=1))
-    welded = np.empty(len(vertices), np.int64)
-    welded[order] = np.cumsum(changes)
-    return welded
+    numbers = np.empty(len(vertices), np.int64)
+    numbers[order] = np.cumsum(changes)
+    return numbers
 
 
 def _side(
@@ -215,10 +222,10 @@ def connectivity(
     vertices: Float64[np.ndarray, "points 3"], faces: Int64[np.ndarray, "faces 3"]
 ) -> Connectivity:
     """Count the defects that change what a bake means, and find the side that faces show."""
-    welded = _weld(vertices)[faces]
-    edges = np.sort(welded[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    corners = welded(vertices)[faces]
+    edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges, per_edge = _distinct_rows(edges[edges[:, 0] != edges[:, 1]])
-    _, per_face = _distinct_rows(np.sort(welded, axis=1))
+    _, per_face = _distinct_rows(np.sort(corners, axis=1))
     links = sparse.coo_matrix(
         (np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices), len(vertices))
     )
@@ -231,5 +238,5 @@ def connectivity(
         duplicate_faces=int((per_face - 1).sum()),
         open_edges=int((per_edge == 1).sum()),
         non_manifold_edges=int((per_edge > 2).sum()),
-        side=_side(unit, faces, labels[welded[:, 0]], np.unique(labels[edges[per_edge == 1, 0]])),
+        side=_side(unit, faces, labels[corners[:, 0]], np.unique(labels[edges[per_edge == 1, 0]])),
     )

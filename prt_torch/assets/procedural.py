@@ -1,4 +1,4 @@
-"""Geometry made of formulas: the ground under a mesh, and a scene that needs no file."""
+"""Geometry made of formulas: the ground under a mesh, textured surfaces, scenes without a file."""
 
 import math
 from collections.abc import Callable
@@ -18,11 +18,15 @@ _TURNS_AROUND_AXIS = 2
 _TURNS_THROUGH_HOLE = 3
 
 
-def _grid_faces(rows: int, cols: int, *, wrap: bool = False) -> Int64[Tensor, "faces 3"]:
+def grid_faces(rows: int, cols: int, *, wrap: bool = False) -> Int64[Tensor, "faces 3"]:
     """Triangles of a grid of points in row order.
 
-    With rows along a and columns along b, faces are counter-clockwise seen from a x b. ``wrap``
-    joins the last row and column to the first.
+    With rows along a and columns along b, faces are counter-clockwise seen from a x b.
+
+    Args:
+        rows: Points along a.
+        cols: Points along b.
+        wrap: Join the last row and column to the first.
     """
     a = torch.arange(rows if wrap else rows - 1)[:, None]
     b = torch.arange(cols if wrap else cols - 1)[None, :]
@@ -75,9 +79,73 @@ def ground_plane(
     z, x = torch.meshgrid(centre[2] + line, centre[0] + line, indexing="ij")
     vertices = torch.stack([x, height.expand_as(x), z], dim=-1).reshape(-1, 3)
     colour = torch.tensor(albedo, dtype=torch.float64).expand(len(vertices), 3)
-    plane = mesh_from_arrays("ground", vertices, _grid_faces(resolution, resolution), albedo=colour)
+    plane = mesh_from_arrays("ground", vertices, grid_faces(resolution, resolution), albedo=colour)
     # Its border is meant to be open.
     return replace(plane, warnings=())
+
+
+def grid_surface(
+    name: str,
+    positions: Float64[Tensor, "rows cols 3"],
+    *,
+    closed: bool = False,
+    repeats: tuple[float, float] = (1.0, 1.0),
+) -> Mesh:
+    """A surface of a grid of points, with texture coordinates along it.
+
+    As an image lies on it: u grows with the column, v falls with the row, and the outside is where
+    u is to the right and v is up.
+
+    Args:
+        name: What messages and reports call it.
+        positions: In row order.
+        closed: Whether the last column is joined to the first, without points of its own: texture
+            coordinates are those of faces, so their seam splits no point.
+        repeats: How often a texture repeats along u and along v.
+
+    Raises:
+        InputError: If there are fewer than 2 rows or columns, or a number is not finite.
+    """
+    rows, cols = positions.shape[:2]
+    if min(rows, cols) < 2:
+        raise InputError(f"{name}: expected a grid of at least 2 x 2 points, got {rows} x {cols}")
+    steps = cols if closed else cols - 1
+    faces = grid_faces(rows, steps + 1)
+    row, col = faces // (steps + 1), faces % (steps + 1)
+    u, v = col / steps * repeats[0], (1.0 - row / (rows - 1)) * repeats[1]
+    return mesh_from_arrays(
+        name,
+        positions.reshape(-1, 3),
+        row * cols + col % cols,
+        uv=torch.stack([u, v], dim=-1).double(),
+    )
+
+
+def surface_of_revolution(
+    name: str,
+    profile: Float64[Tensor, "rings 2"],
+    columns: int,
+    *,
+    repeats: tuple[float, float] = (1.0, 1.0),
+) -> Mesh:
+    """A surface around the y axis, with u around it and v along it.
+
+    Args:
+        name: What messages and reports call it.
+        profile: Radius and height of each ring, from the top to the bottom.
+        columns: Points of a ring, at least 3.
+        repeats: How often a texture repeats around and along the surface.
+
+    Raises:
+        InputError: If there are too few rings or columns, or a number is not finite.
+    """
+    if columns < 3:
+        raise InputError(f"{name}: expected at least 3 columns, got {columns}")
+    angle = torch.arange(columns, dtype=torch.float64) * (2 * math.pi / columns)
+    radius, height = profile[:, 0:1], profile[:, 1:2]
+    x, z = radius * angle.sin(), radius * angle.cos()
+    positions = torch.stack([x, height.expand_as(x), z], dim=-1)
+    return grid_surface(name, positions, closed=True, repeats=repeats)
 
 
 def _knot_albedo(
@@ -125,7 +193,7 @@ def _torus_knot(num_along: int, num_around: int) -> Mesh:
     return mesh_from_arrays(
         "torus_knot",
         vertices.reshape(-1, 3),
-        _grid_faces(num_along, num_around, wrap=True),
+        grid_faces(num_along, num_around, wrap=True),
         albedo=_knot_albedo(t[:, None].expand(shape).reshape(-1), around.expand(shape).reshape(-1)),
     )
 
@@ -136,14 +204,27 @@ def _knot_on_ground(detail: int) -> Mesh:
     return concatenate([knot, ground], "torus_knot")
 
 
-_SCENES: dict[str, Callable[[int], Mesh]] = {"torus_knot": _knot_on_ground}
+def _vase(detail: int) -> Mesh:
+    """A foot, a belly and a neck with a lip; open at the top, textures repeat 8 x 8 times."""
+    height = torch.linspace(2.0, 0.0, 96 * detail, dtype=torch.float64)
+    belly = 0.34 * torch.exp(-((height - 0.85) / 0.48).square())
+    lip = 0.16 * torch.exp(-((height - 2.0) / 0.16).square())
+    foot = 0.10 * torch.exp(-(height / 0.12).square())
+    profile = torch.stack([0.24 + belly + lip + foot, height], dim=-1)
+    vase = surface_of_revolution("vase", profile, 128 * detail, repeats=(8.0, 8.0))
+    # Open at the top, as vases are, and at the bottom, where it stands.
+    return replace(vase, warnings=())
+
+
+_SCENES: dict[str, Callable[[int], Mesh]] = {"torus_knot": _knot_on_ground, "vase": _vase}
 
 
 def procedural_scene(name: str = "torus_knot", *, detail: int = 1) -> Mesh:
     """A scene made of formulas, the same on every machine.
 
     ``torus_knot`` is a knotted tube with coloured bands over a grey ground: closed, shadowing
-    itself, 7,104 points.
+    itself, 7,104 points. ``vase`` is a surface of revolution with texture coordinates, 12,288
+    points, without a ground.
 
     Args:
         name: Which scene.

@@ -1,4 +1,4 @@
-"""A strict reader of Wavefront OBJ: vertices, normals, faces, and the names of groups of faces.
+"""A strict reader of Wavefront OBJ: vertices, faces, their groups, normals and texture coordinates.
 
 One point per ``v`` line, whatever texture coordinates and normals the corners name. General
 loaders split vertices at texture seams, drop those with NaN and wrap index 0 to the last vertex,
@@ -29,6 +29,16 @@ def _index(word: bytes, count: int) -> int:
     return count + index if -count <= index < 0 else index - 1
 
 
+def _named(field: list[bytes], what: str, count: int) -> int:
+    """Zero-based index of what a corner names; -1 where it names none."""
+    if not field or not field[0]:
+        return -1
+    index = _index(field[0], count)
+    if not 0 <= index < count:
+        raise ValueError(f"{what} {int(field[0])} does not exist ({count} so far)")
+    return index
+
+
 class _Lines:
     """What the lines of the file say, gathered in file order."""
 
@@ -38,6 +48,8 @@ class _Lines:
         self.normals: list[tuple[float, ...]] = []
         self.corners: list[int] = []
         self.corner_normals: list[int] = []
+        self.uv: list[tuple[float, ...]] = []
+        self.corner_uv: list[int] = []
         self.sizes: list[int] = []
         self.groups: dict[bytes, list[tuple[int, str]]] = {b"usemtl": [], b"g": [], b"o": []}
 
@@ -54,6 +66,10 @@ class _Lines:
                 if len(words) < 4:
                     raise ValueError("a normal needs 3 components")
                 self.normals.append(_numbers(words[1:4]))
+            case b"vt":
+                if len(words) < 2:
+                    raise ValueError("texture coordinates need at least 1 number")
+                self.uv.append((*_numbers(words[1:3]), 0.0)[:2])
             case b"f":
                 self._add_face(words[1:])
             case b"usemtl" | b"g" | b"o":
@@ -82,15 +98,8 @@ class _Lines:
         for word in words:
             fields = word.split(b"/")
             self.corners.append(_index(fields[0], len(self.vertices)))
-            if len(fields) > 2 and fields[2]:
-                normal = _index(fields[2], len(self.normals))
-                if not 0 <= normal < len(self.normals):
-                    raise ValueError(
-                        f"normal {int(fields[2])} does not exist ({len(self.normals)} so far)"
-                    )
-                self.corner_normals.append(normal)
-            else:
-                self.corner_normals.append(-1)
+            self.corner_uv.append(_named(fields[1:2], "texture coordinate", len(self.uv)))
+            self.corner_normals.append(_named(fields[2:3], "normal", len(self.normals)))
         self.sizes.append(len(words))
 
 
@@ -111,6 +120,14 @@ def _vertex_normals(
     split = np.unique(vertex[differs])
     result[split] = np.nan
     return result, len(split)
+
+
+def _corner_uv(lines: _Lines) -> Float64[np.ndarray, "corners 2"] | None:
+    """Texture coordinates of every corner, NaN where it names none."""
+    if not lines.uv:
+        return None
+    # The last row is what corners that name none, -1, refer to.
+    return np.array([*lines.uv, (np.nan, np.nan)], np.float64)[np.array(lines.corner_uv, np.int64)]
 
 
 def read_obj(path: Path, data: bytes) -> RawMesh:
@@ -151,5 +168,6 @@ def read_obj(path: Path, data: bytes) -> RawMesh:
         albedo=None if np.isnan(colours).all() else linear_from_srgb(colours),
         first_index=1,
         split_normals=split,
+        uv=_corner_uv(lines),
         parts=lines.parts(),
     )

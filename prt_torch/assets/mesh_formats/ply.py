@@ -30,6 +30,7 @@ _ORDERS: dict[str, Literal["=", "<", ">"]] = {
     "binary_little_endian": "<",
     "binary_big_endian": ">",
 }
+_UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 _MAX_HEADER_BYTES = 1 << 16
 
 
@@ -205,13 +206,19 @@ def _ascii_as_doubles(
     return body, widened
 
 
-def _triple(
-    columns: dict[str, _Column], names: tuple[str, str, str]
-) -> Float64[np.ndarray, "points 3"] | None:
-    """Three scalar properties side by side, or None where one is missing."""
+def _columns(
+    columns: dict[str, _Column], names: tuple[str, ...]
+) -> Float64[np.ndarray, "points width"] | None:
+    """Scalar properties side by side, or None where one is missing."""
     if not all(name in columns for name in names):
         return None
     return np.stack([columns[name][0].astype(np.float64) for name in names], axis=1)
+
+
+def _uv(columns: dict[str, _Column]) -> Float64[np.ndarray, "points 2"] | None:
+    """Texture coordinates by any of the names in use."""
+    found = (_columns(columns, names) for names in _UV_NAMES)
+    return next((uv for uv in found if uv is not None), None)
 
 
 def _albedo(
@@ -219,7 +226,7 @@ def _albedo(
 ) -> Float64[np.ndarray, "points 3"] | None:
     """Linear vertex colours; integers are fractions of their type's maximum."""
     names = ("red", "green", "blue")
-    colour = _triple(columns, names)
+    colour = _columns(columns, names)
     if colour is None:
         return None
     dtype = next(item.dtype for item in element.properties if item.name == "red")
@@ -235,8 +242,21 @@ def _whole(path: Path, indices: np.ndarray) -> Int64[np.ndarray, "corners"]:
     return indices.astype(np.int64)
 
 
+def _at_corners(
+    uv: Float64[np.ndarray, "points 2"] | None, corners: Int64[np.ndarray, "corners"]
+) -> Float64[np.ndarray, "corners 2"] | None:
+    """What vertices have, at the corners of faces; NaN at corners out of range, refused later."""
+    if uv is None:
+        return None
+    inside = (corners >= 0) & (corners < len(uv))
+    # The last row stands for vertices that there are not.
+    return np.append(uv, [[np.nan, np.nan]], axis=0)[np.where(inside, corners, -1)]
+
+
 def read_ply(path: Path, data: bytes) -> RawMesh:
     """Read a PLY file; vertex colours (red, green, blue) are taken as sRGB.
+
+    Texture coordinates are those of vertices (s and t, or u and v), v up.
 
     Raises:
         InputError: If the header is not understood or the file ends early.
@@ -246,16 +266,17 @@ def read_ply(path: Path, data: bytes) -> RawMesh:
         body, layouts = _ascii_as_doubles(path, data[start:], elements)
     else:
         body, layouts = np.frombuffer(data[start:], np.uint8), elements
-    vertices = normals = albedo = None
+    vertices = normals = albedo = uv = None
     corners: Int64[np.ndarray, "corners"] = np.zeros(0, np.int64)
     sizes: Int64[np.ndarray, "polygons"] = np.zeros(0, np.int64)
     position = 0
     for element, layout in zip(elements, layouts, strict=True):
         columns, position = _read_element(path, body, position, layout)
         if element.name == "vertex":
-            vertices = _triple(columns, ("x", "y", "z"))
-            normals = _triple(columns, ("nx", "ny", "nz"))
+            vertices = _columns(columns, ("x", "y", "z"))
+            normals = _columns(columns, ("nx", "ny", "nz"))
             albedo = _albedo(columns, element)
+            uv = _uv(columns)
         elif element.name == "face":
             name = next((n for n in ("vertex_indices", "vertex_index") if n in columns), None)
             if name is None:
@@ -269,4 +290,5 @@ def read_ply(path: Path, data: bytes) -> RawMesh:
         sizes=sizes,
         normals=normals if normals is None else finite_normals(normals),
         albedo=albedo,
+        uv=_at_corners(uv, corners),
     )

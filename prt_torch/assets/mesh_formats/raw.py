@@ -34,6 +34,8 @@ class RawMesh:
     """Normals from the file, of any length; NaN where it gives none, zero where unusable."""
     albedo: Float64[np.ndarray, "points 3"] | None = None
     """Linear vertex colours; NaN where the file gives none."""
+    uv: Float64[np.ndarray, "corners 2"] | None = None
+    """Texture coordinates of every polygon corner, v up; not finite where there are none."""
     parts: tuple[RawPart, ...] = ()
     """Parts of the file, or none where it knows no parts."""
     first_index: int = 0
