@@ -71,6 +71,11 @@ def load_inputs(config: RunConfig) -> Inputs:
     names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
+    if config.transfer.exit_basis and not any(made_of.glossy for made_of in materials.values()):
+        raise InputError(
+            f"transfer.exit_basis: {config.transfer.exit_basis} are of glossy materials, and no "
+            "part of the scene has one"
+        )
     fine = config.transfer.resolution * config.transfer.supersampling
     check_memory(basis, fine, config.memory_budget)
     return inputs

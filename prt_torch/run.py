@@ -159,6 +159,7 @@ def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor
             inputs.mesh,
             materials=inputs.materials,
             light_basis=inputs.light_basis,
+            exit_basis=config.transfer.exit_basis,
             num_rows=config.transfer.rows,
             max_bounces=config.transfer.max_bounces,
             tolerance=config.transfer.tolerance,

@@ -79,8 +79,11 @@ class TransferConfig(_Section):
     light_kernel: Literal["gaussian", "abel_poisson"] = Field("gaussian", description="their shape")
     resolution: int = Field(32, ge=2, le=512, description="texels along a visibility cube's edge")
     supersampling: int = Field(4, ge=1, le=16, description="rays along a texel's edge")
+    exit_basis: Literal["harmonics", "factors"] | None = Field(
+        None, description="of glossy scenes; null is harmonics for sh, else BRDF factors"
+    )
     rows: int | None = Field(
-        None, ge=2, le=64, description="exit functions of glossy scenes; null is 24 for sh, else 10"
+        None, ge=2, le=64, description="exit functions; null is 24 harmonics, or 10 factors"
     )
     max_bounces: int = Field(0, ge=0, le=64, description="0 is direct light only")
     tolerance: float = Field(1e-3, ge=0, lt=1, description="share of the light of a last bounce")
@@ -92,6 +95,16 @@ class TransferConfig(_Section):
                 "odd",
                 "resolution times supersampling must be even, got {resolution} times {factor}",
                 {"resolution": self.resolution, "factor": self.supersampling},
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _harmonics_meet_harmonics(self) -> "TransferConfig":
+        if self.exit_basis == "harmonics" and self.light_basis != "sh":
+            raise PydanticCustomError(
+                "exit_basis",
+                "exit_basis=harmonics needs light_basis=sh, got {basis}",
+                {"basis": self.light_basis},
             )
         return self
 

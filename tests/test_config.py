@@ -226,6 +226,12 @@ class TestRefusals:
         assert message.startswith(f"{key}: ")
         assert expected in message
 
+    def test_exit_functions_that_the_light_does_not_have(self):
+        message = refusal("transfer=haar", "transfer.exit_basis=harmonics")
+        assert message == "transfer: exit_basis=harmonics needs light_basis=sh, got haar"
+        assert "'factors'" in refusal("transfer.exit_basis=wavelets")
+        assert one("transfer=haar", "transfer.exit_basis=factors").transfer.exit_basis == "factors"
+
     @pytest.mark.parametrize("resolution", [3, 31])
     def test_bits_that_do_not_fill_bytes(self, resolution):
         message = refusal(f"transfer.resolution={resolution}", "transfer.supersampling=1")

@@ -2,7 +2,9 @@
 
 from prt_torch.baking.direct import project_diffuse
 from prt_torch.baking.glossy import project_glossy
+from prt_torch.baking.groove import groove_transfer
 from prt_torch.baking.interreflection import Bounces, interreflect
+from prt_torch.baking.patch import bake_patch
 from prt_torch.baking.projection import check_memory
 from prt_torch.baking.reflection import (
     RESOLVED,
@@ -23,9 +25,11 @@ __all__ = [
     "Stages",
     "VisibilityField",
     "bake",
+    "bake_patch",
     "check_memory",
     "diffuse_reflection",
     "glossy_reflection",
+    "groove_transfer",
     "interreflect",
     "project_brdf",
     "project_diffuse",

@@ -19,7 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ from prt_torch import store
 from prt_torch.assets.brdf import BRDF
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.projection import pieces, project_points
+from prt_torch.baking.reflection import EQUAL_AREA, factor_in_harmonics
 from prt_torch.baking.visibility import Progress, VisibilityField
 from prt_torch.bases import SRBF, BRDFFactors, HemisphereMap, TexelBasis
 from prt_torch.errors import InputError
@@ -39,7 +40,7 @@ from prt_torch.transfer import Surface, TransferTensor
 _SHARD_BYTES = 2**26
 _POINTS_AT_ONCE = 16
 _ALGORITHM = 3  # raise it when the same inputs would give other values
-_FACTORING = 2  # likewise of factors
+_FACTORING = 3  # likewise of factors
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,13 @@ def project_factored(
 
 
 def kept_factors(
-    brdfs: Sequence[BRDF], *, num_terms: int, constants: Literal[0, 1, 3], cache: Path | None
-) -> BRDFFactors:
+    brdfs: Sequence[BRDF],
+    *,
+    num_terms: int,
+    constants: Literal[0, 1, 3],
+    cache: Path | None,
+    light_order: int | None = None,
+) -> tuple[BRDFFactors, float]:
     """Factors of materials, made once: a bake and what relights it must share them to the bit.
 
     Singular vectors may come out with other signs on other numbers of threads.
@@ -148,29 +154,42 @@ def kept_factors(
         num_terms: Rows.
         constants: How many of them are constants.
         cache: Folder of bakes; None makes them anew.
+        light_order: Bands of a light side in harmonics, with equal-area view maps; None for maps
+            on both sides.
+
+    Returns:
+        The factors, and the relative change of the worst material when its quadrature was last
+        doubled; zero for maps, which expect their error themselves.
 
     Raises:
         InputError: If the cache cannot be written or is damaged.
     """
+    options: dict[str, Any] = {"num_terms": num_terms, "constants": constants}
+    if light_order is not None:
+        options["light_order"] = light_order
 
     def make(_: slice) -> tuple[dict[str, Tensor], dict[str, int | float]]:
-        made = BRDFFactors.from_brdf(brdfs, num_terms=num_terms, constants=constants)
+        if light_order is None:
+            made, change = BRDFFactors.from_brdf(brdfs, **options), 0.0
+        else:
+            made, change = factor_in_harmonics(brdfs, **options)
         maps = {"view": made.view_values, "light": made.light_values}
         tensors = {name: values.detach()[None] for name, values in maps.items()}
-        return {**tensors, "rms": torch.tensor([made.rms], dtype=torch.float64)}, {}
+        quality = torch.tensor([[made.rms, change]], dtype=torch.float64)
+        return {**tensors, "quality": quality}, {}
 
     inputs = {
         "brdfs": [brdf.describe() for brdf in brdfs],
-        "num_terms": num_terms,
-        "constants": constants,
+        **options,
         "algorithm": _FACTORING,
     }
     folder = None if cache is None else cache / f"factors-{store.digest(inputs)[:16]}"
     found = store.build_sharded(make, rows=1, rows_per_shard=1, inputs=inputs, folder=folder)
-    view, light, rms = (found.tensors[name][0:1][0] for name in ("view", "light", "rms"))
-    factors = BRDFFactors(view, light, HemisphereMap(), num_constants=constants)
-    factors.rms = float(rms)
-    return factors
+    view, light, quality = (found.tensors[name][0:1][0] for name in ("view", "light", "quality"))
+    hemisphere = HemisphereMap() if light_order is None else EQUAL_AREA
+    factors = BRDFFactors(view, light, hemisphere, light_order=light_order, num_constants=constants)
+    factors.rms = float(quality[0])
+    return factors, float(quality[1])
 
 
 def check_resolution(light_basis: TexelBasis, resolution: int) -> None:

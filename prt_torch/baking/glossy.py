@@ -9,8 +9,12 @@ onto the few harmonics of order ``n_i + n_j - 1``; no material and no pair of fu
 summed over texels. Turned into the shading frame, T meets the material's matrix:
 ``M_p = A⁻¹ B A⁻¹ R_p T_p``.
 
+The same T of as many bands as the material has says how much of the transfer no light of fewer
+bands can meet: rows :math:`V \beta_k` have the inner products :math:`\beta T \beta^T`.
+
 Source:
-    Sloan, Hall, Hart, Snyder 2003, section 3.1 and equation 1.
+    Sloan, Hall, Hart, Snyder 2003, section 3.1 and equation 1; Sloan, Luna, Snyder 2005, equation
+    15, for rows of BRDF factors.
 """
 
 from pathlib import Path
@@ -27,7 +31,7 @@ from prt_torch.sphere import cubemap_solid_angles, frame_from_normal
 from prt_torch.transfer import Surface, TransferTensor
 
 _POINTS_PER_SHARD = 1024
-_ALGORITHM = 1  # raise it when the same inputs would give other values
+_ALGORITHM = 2  # raise it when the same inputs would give other values
 
 
 def project_glossy(
@@ -54,16 +58,19 @@ def project_glossy(
         progress: Told of points done and points in all.
 
     Returns:
-        Rows of the reflection's exit basis. Points without a normal have zero transfer.
+        Rows of the reflection's exit basis. Points without a normal have zero transfer. Norms of
+        reference are those of visibility times the material in all of its bands.
 
     Raises:
         ValueError: If mesh and visibility do not belong together.
         InputError: If the memory budget is too small, or the cache cannot be written or is damaged.
     """
-    seen_basis = SphericalHarmonics(reflection.order + light_basis.order - 1)
+    wide = max(reflection.order, light_basis.order)
+    seen_basis = SphericalHarmonics(reflection.order + wide - 1)
     at_once = check_memory(seen_basis, visibility.resolution, memory_budget)
     solid_angles = cubemap_solid_angles(visibility.resolution).reshape(-1)
-    products = sh.product_matrix(reflection.order, light_basis.order).flatten(0, 1).mT
+    products = sh.product_matrix(reflection.order, wide).flatten(0, 1).mT
+    gram = reflection.exit_basis.gram()
     frames = frame_from_normal(mesh.normals)
 
     def project(rows: slice) -> dict[str, Tensor]:
@@ -72,9 +79,14 @@ def project_glossy(
             seen = visibility.unpack(some).float() * solid_angles
             projected.append(seen_basis.project_cube(seen, visibility.resolution))
         incident = torch.cat(projected).double() @ products
-        incident = incident.unflatten(1, (reflection.order**2, light_basis.num_coeffs))
-        local = sh.rotation_matrix(frames[rows], reflection.order) @ incident
-        return {"values": reflection.reflect(rows, local[:, None]).float()}
+        incident = incident.unflatten(1, (reflection.order**2, wide**2))
+        to_local = sh.rotation_matrix(frames[rows], reflection.order)
+        local = (to_local @ incident)[:, None]
+        values = reflection.reflect(rows, local[..., : light_basis.num_coeffs])
+        own = local[..., : reflection.order**2] @ to_local.mT[:, None]
+        met = reflection.reflect(rows, reflection.reflect(rows, own).mT)
+        norms = torch.einsum("kl,pclk->p", gram, met).clamp_min(0.0)
+        return {"values": values.float(), "reference_squared_norm": norms}
 
     surface = Surface(
         exit_basis=reflection.exit_basis,

@@ -33,7 +33,7 @@ from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.hits import HitFinder, Hits
 from prt_torch.baking.reflection import Reflection
 from prt_torch.baking.visibility import Progress, VisibilityField
-from prt_torch.bases import Diffuse, ExitBasis, HemisphericalHarmonics, sh
+from prt_torch.bases import BRDFFactors, Diffuse, ExitBasis, HemisphericalHarmonics, sh
 from prt_torch.sphere import cubemap_directions, frame_from_normal
 from prt_torch.transfer import colour_channels
 
@@ -312,5 +312,13 @@ def _in_harmonics(exit_basis: ExitBasis) -> tuple[Float64[Tensor, "harmonics row
             embedding = torch.zeros(order * order, exit_basis.num_rows, dtype=torch.float64)
             embedding[exit_basis.indices, torch.arange(exit_basis.num_rows)] = 1.0
             return embedding, order
+        case BRDFFactors(light_order=int(order), num_channels=1):
+            # Maps of views are fitted with as many bands as their material has towards light.
+            views, weights = sh.hemisphere_quadrature(4 * exit_basis.hemisphere.resolution)
+            fit = sh.hemisphere_projection(sh.evaluate(views, order), weights)
+            return fit @ exit_basis.evaluate(views).detach().double().cpu(), order
         case _:
-            raise ValueError(f"expected a diffuse or hemispherical exit basis, got {exit_basis}")
+            raise ValueError(
+                "expected an exit basis that is diffuse, hemispherical, or of grey factors whose "
+                f"light side is in harmonics, got {exit_basis}"
+            )

@@ -9,11 +9,15 @@ hemisphere. For each function of the exit basis k
 so that exit radiance is ``M @ J`` with :math:`J_i = \int_H L(s)\, y_i(s)\, ds`. Both projections
 are least-squares optimal over the hemisphere, hence :math:`M = A^{-1} B A^{-1}` of the paper.
 
+Where the exit basis are BRDF factors, their light functions are such :math:`\beta_k` already: their
+inner products with the harmonics are known, and A⁻¹ makes the least-squares fit of them.
+
 The Lambertian part needs no fit (its light side is linear, its view side constant), and its
 albedo may differ from point to point, so it is kept apart.
 
 Source:
-    Sloan, Hall, Hart, Snyder 2003, section 3.1 and equation 1.
+    Sloan, Hall, Hart, Snyder 2003, section 3.1 and equation 1; Sloan, Luna, Snyder 2005, section
+    3.2 and equation 15.
 """
 
 import math
@@ -26,12 +30,23 @@ from torch import Tensor
 
 from prt_torch import store
 from prt_torch.assets.brdf import BRDF, lobe_quadrature
-from prt_torch.bases import Diffuse, ExitBasis, HemisphericalHarmonics, sh
+from prt_torch.bases import (
+    BRDFFactors,
+    Diffuse,
+    ExitBasis,
+    HemisphereMap,
+    HemisphericalHarmonics,
+    sh,
+)
+from prt_torch.bases.brdf_factoring import decomposed
 
 _COSINE = math.sqrt(4.0 * math.pi / 3.0)  # s_z over y_10
 _FIRST_NODES, _MOST_NODES, _MOST_NODES_ANISOTROPIC = 8, 64, 16
 _LIGHT_NODES = 3  # radial nodes of a lobe for each node of the polar angle of views
 _PAIRS_AT_ONCE = 2**23
+EQUAL_AREA = HemisphereMap("concentric")
+"""View maps of factors whose light side is in harmonics: 32 x 32, as the paper has it."""
+
 RESOLVED = 0.03
 """Relative change on doubling the quadrature below which a material counts as resolved.
 
@@ -64,13 +79,19 @@ class Reflection:
 
     @property
     def num_channels(self) -> int:
-        """1 where its colour factors out, else 3."""
-        return max(self.matrices.shape[1], self.lambertian.shape[1])
+        """Of transfer: 1 where its colour factors out or is in the exit functions, else 3."""
+        return max(self.matrices.shape[1], 1 if self._own_tints else self.lambertian.shape[1])
+
+    @property
+    def _own_tints(self) -> bool:
+        """Whether each colour has a constant exit function of its own."""
+        return len(self.exit_basis.constants()) == 3
 
     def digest(self) -> str:
         """SHA-256 of everything that reflected light follows from."""
         parts = (self.matrices, self.materials, self.lambertian)
-        return store.digest(self.exit_basis.describe(), self.order, *parts)
+        functions = self.exit_basis.tensors().values()
+        return store.digest(self.exit_basis.describe(), self.order, *parts, *functions)
 
     def reflect(
         self, rows: slice, incident: Float[Tensor, "points channels incident coeffs"]
@@ -86,9 +107,12 @@ class Reflection:
         shared = len(self.lambertian) == 1
         albedo = (self.lambertian if shared else self.lambertian[rows]).to(incident)
         if bool((albedo != 0).any()):
-            constant = float(self.exit_basis.constants()[0, 0])
-            irradiance = incident[:, :, 2] * (_COSINE / math.pi * constant)
-            lambertian = albedo[:, :, None] * irradiance
+            irradiance = incident[:, :, 2] * (_COSINE / math.pi)
+            constants = self.exit_basis.constants().to(incident)
+            if self._own_tints:
+                tinted = albedo.expand(-1, 3) @ constants
+                return exit_radiance + tinted[:, None, :, None] * irradiance[:, :, None]
+            lambertian = albedo[:, :, None] * (irradiance * constants[0, 0])
             channels = max(exit_radiance.shape[1], lambertian.shape[1])
             exit_radiance = exit_radiance.expand(-1, channels, -1, -1).clone()
             exit_radiance[:, :, 0] += lambertian
@@ -137,6 +161,111 @@ def glossy_reflection(
     return Reflection(exit_basis, order, matrices, materials, lambertian.double(), unresolved)
 
 
+def factored_reflection(
+    factors: BRDFFactors,
+    materials: Int[Tensor, "points"],
+    lambertian: Float[Tensor, "points own_channels"],
+    *,
+    unresolved: float = 0.0,
+) -> Reflection:
+    r"""Reflection towards BRDF factors: transfer :math:`M' = \Sigma V^T T` of few rows.
+
+    T is rectangular: from the bands of the light basis to those of the factors' light side. The
+    material acts on the least-squares fit to incident light over the upper hemisphere (A⁻¹), so
+    that where nothing is shadowed, light of no more bands than the factors' is reflected exactly.
+
+    Args:
+        factors: Of all glossy materials, their light side in harmonics.
+        materials: Which of them each point has; -1 for none.
+        lambertian: Albedo of the Lambertian part of each point, one colour or three; it enters the
+            constant rows, and needs none where there are none.
+        unresolved: As :attr:`Reflection.unresolved`.
+
+    Raises:
+        ValueError: If the factors' light side are maps, or they have no constants for a Lambertian
+            part.
+
+    Source:
+        Sloan, Luna, Snyder 2005, equation 15, which leaves open how T treats the hemisphere.
+    """
+    if factors.light_order is None:
+        raise ValueError("expected light functions in harmonics (method='harmonic'), got maps")
+    if bool((lambertian != 0).any()) and not factors.num_constants:
+        raise ValueError("expected factors with constants for a Lambertian part, got none")
+    light_sides = factors.light_values.detach().double().cpu()
+    own = light_sides @ sh.hemisphere_inverse(factors.light_order)
+    none = torch.zeros_like(own[:1])  # the last, where -1 points to
+    return Reflection(
+        factors,
+        factors.light_order,
+        torch.cat([own, none])[:, None],
+        materials,
+        lambertian.double(),
+        unresolved,
+    )
+
+
+def factor_in_harmonics(
+    brdfs: Sequence[BRDF], *, num_terms: int, constants: int, light_order: int
+) -> tuple[BRDFFactors, float]:
+    """Factors of materials that share equal-area view maps, their light side in harmonics.
+
+    As :meth:`BRDFFactors.from_brdf` makes them, with nodes that follow the lobe of each view.
+
+    Args:
+        brdfs: The materials.
+        num_terms: Rows in all.
+        constants: How many of them are constants.
+        light_order: Bands of the light side.
+
+    Returns:
+        The factors, and the relative change of the worst material at the last doubling of nodes.
+    """
+    views, used = EQUAL_AREA.centres()
+    whiten = sh.hemisphere_inverse(light_order) @ torch.linalg.cholesky(
+        sh.hemisphere_gram(light_order)
+    )
+    colours = max(brdf.num_channels for brdf in brdfs)
+    projected, energy, worst = [], 0.0, 0.0
+    for brdf in brdfs:
+        most = _MOST_NODES if brdf.isotropic else _MOST_NODES_ANISOTROPIC
+        nodes, change = _FIRST_NODES, math.inf
+        own, squares = _at_views(brdf, views[used], light_order, nodes)
+        while change > RESOLVED and nodes < most:
+            nodes *= 2
+            coarser = own
+            own, squares = _at_views(brdf, views[used], light_order, nodes)
+            change = float(((own - coarser) @ whiten).norm()) / (float((own @ whiten).norm()) or 1)
+        projected.append(own.expand(-1, colours, -1))
+        energy += float(squares.sum()) * colours / brdf.num_channels
+        worst = max(worst, change)
+    found = decomposed(
+        torch.stack(projected, dim=2), energy, EQUAL_AREA, num_terms, constants=constants
+    )
+    options = {"light_order": light_order, "num_constants": constants}
+    return BRDFFactors.of(found, EQUAL_AREA, **options), worst
+
+
+def _at_views(
+    brdf: BRDF, views: Float[Tensor, "views 3"], order: int, nodes: int
+) -> tuple[Float[Tensor, "views channels incident"], Float[Tensor, "views"]]:
+    """As :func:`_inner_products`; isotropic materials are summed once for each polar angle."""
+    if not brdf.isotropic:
+        return _inner_products(brdf, views, order, nodes)
+    z, ring = torch.unique(views[:, 2].round(decimals=9), return_inverse=True)
+    profile = torch.stack([(1 - z * z).clamp_min(0).sqrt(), torch.zeros_like(z), z], dim=-1)
+    products, squares = _inner_products(brdf, profile, order, nodes)
+    turns = _turns(torch.atan2(views[:, 1], views[:, 0]), order)
+    return torch.einsum("vij,vcj->vci", turns, products[ring]), squares[ring]
+
+
+def _turns(angles: Float[Tensor, "angles"], order: int) -> Float[Tensor, "angles i j"]:
+    """Matrices that turn harmonics about the normal."""
+    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    rows = [angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one]
+    return sh.rotation_matrix(torch.stack(rows, -1).unflatten(-1, (3, 3)), order)
+
+
 def project_brdf(
     brdf: BRDF, exit_basis: HemisphericalHarmonics, order: int
 ) -> tuple[Float[Tensor, "channels rows incident"], float]:
@@ -175,9 +304,7 @@ def _matrix(
     profile = _light_side(brdf, view.unflatten(0, (nodes, steps))[:, 0], order, nodes)
     # Turning the view of an isotropic material about the normal turns its light side with it.
     angles = torch.arange(steps, dtype=torch.float64) * (2.0 * math.pi / steps)
-    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
-    rows = [angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one]
-    turns = sh.rotation_matrix(torch.stack(rows, -1).unflatten(-1, (3, 3)), order)
+    turns = _turns(angles, order)
     by_azimuth = torch.einsum("kza,aij->kzij", project_view.unflatten(1, (nodes, steps)), turns)
     return torch.einsum("kzij,zcj->cki", by_azimuth, profile)
 
@@ -185,15 +312,24 @@ def _matrix(
 def _light_side(
     brdf: BRDF, views: Float[Tensor, "views 3"], order: int, nodes: int
 ) -> Float[Tensor, "views channels incident"]:
-    """Harmonic coefficients over the hemisphere of BRDF times cosine, for each view.
+    """Harmonic coefficients over the hemisphere of BRDF times cosine, for each view."""
+    return _inner_products(brdf, views, order, nodes)[0] @ sh.hemisphere_inverse(order)
 
-    Inner products come from nodes that follow the lobe of each view, however narrow it is.
+
+def _inner_products(
+    brdf: BRDF, views: Float[Tensor, "views 3"], order: int, nodes: int
+) -> tuple[Float[Tensor, "views channels incident"], Float[Tensor, "views"]]:
+    """Of BRDF times cosine with the harmonics over the hemisphere, and its squared norm.
+
+    Sums are over nodes that follow the lobe of each view, however narrow it is.
     """
     resolution = _LIGHT_NODES * nodes
     at_once = max(1, _PAIRS_AT_ONCE // (resolution * resolution * order * order))
-    pieces = []
+    products, squares = [], []
     for some in views.split(at_once):
         lights, solid_angles = lobe_quadrature(some, resolution)
-        values = brdf.evaluate(lights, some[:, None]) * (solid_angles * lights[..., 2])[..., None]
-        pieces.append(torch.einsum("vsc,vsi->vci", values, sh.evaluate(lights, order)))
-    return torch.cat(pieces) @ sh.hemisphere_inverse(order)
+        values = brdf.evaluate(lights, some[:, None]) * lights[..., 2:]
+        weighed = values * solid_angles[..., None]
+        products.append(torch.einsum("vsc,vsi->vci", weighed, sh.evaluate(lights, order)))
+        squares.append((values * weighed).sum((1, 2)))
+    return torch.cat(products), torch.cat(squares)

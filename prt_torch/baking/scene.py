@@ -1,10 +1,10 @@
 """From a scene to its transfer tensor: rays, direct light, bounces, light through translucency.
 
 Only what the scene has is computed. A Lambertian scene has one row and its albedo stays a factor;
-glossy points make it matrices, towards hemispherical harmonics where light is in spherical
-harmonics, towards BRDF factors where light is in all frequencies; channels become three only where
-colour cannot factor out; bounces are skipped where nothing hides anything; media cost nothing where
-there are none.
+glossy points make it matrices, towards hemispherical harmonics or a few BRDF factors where light is
+in spherical harmonics, towards BRDF factors where light is in all frequencies; channels become
+three only where colour cannot factor out; bounces are skipped where nothing hides anything; media
+cost nothing where there are none.
 """
 
 import functools
@@ -12,13 +12,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from prt_torch.assets.brdf import Lambert, Sum
+from prt_torch.assets.brdf import BRDF, Lambert, Sum
 from prt_torch.assets.material import Material, assign_materials
 from prt_torch.assets.mesh import Mesh
 from prt_torch.baking.direct import project_diffuse, shared_reflectance
@@ -30,11 +30,17 @@ from prt_torch.baking.factored import (
 )
 from prt_torch.baking.glossy import project_glossy
 from prt_torch.baking.interreflection import Bounces, interreflect
-from prt_torch.baking.reflection import Reflection, diffuse_reflection, glossy_reflection
+from prt_torch.baking.reflection import (
+    Reflection,
+    diffuse_reflection,
+    factored_reflection,
+    glossy_reflection,
+)
 from prt_torch.baking.subsurface import scatter
 from prt_torch.baking.visibility import Progress, VisibilityField, trace_visibility
 from prt_torch.bases import (
     BRDFFactors,
+    Diffuse,
     HemisphericalHarmonics,
     LightBasis,
     SphericalHarmonics,
@@ -48,6 +54,10 @@ Stages = Callable[[str], Progress]
 
 _HARMONICS, _FACTORS = 24, 10  # rows of glossy scenes unless said
 _MORE_LIGHT_BANDS = 1  # of a material's light side than of its view side: costs little, gains much
+_LEAST_LIGHT_BANDS = 2  # of the light side of factors: a Lambertian side is linear
+
+ExitFunctions = Literal["harmonics", "factors"]
+"""What exit radiance of glossy scenes is expanded in."""
 
 
 def bake(
@@ -55,6 +65,7 @@ def bake(
     *,
     materials: Material | Mapping[str, Material] | None = None,
     light_basis: LightBasis | None = None,
+    exit_basis: ExitFunctions | None = None,
     num_rows: int | None = None,
     factors: BRDFFactors | None = None,
     max_bounces: int = 0,
@@ -74,13 +85,15 @@ def bake(
             materials share have one of them unless :func:`~prt_torch.assets.material.split_borders`
             came before.
         light_basis: What to expand the light in; spherical harmonics of order 6 if not given.
-        num_rows: Exit functions of a scene with glossy materials: 24 hemispherical harmonics if
-            light is in spherical harmonics, else 10 BRDF factors (12 where Lambertian colours
-            differ between glossy points, or a medium is coloured), unless given.
+        exit_basis: What glossy exit radiance is expanded in: hemispherical ``harmonics`` (only if
+            light is in spherical harmonics, and then unless said) or BRDF ``factors``.
+        num_rows: Exit functions of a scene with glossy materials: 24 hemispherical harmonics, or
+            10 BRDF factors (12 where Lambertian colours differ between glossy points, or a medium
+            is coloured), unless given.
         factors: BRDF factors of the glossy materials, in the order of ``materials``, in place of
-            those that are made; only where light is not in spherical harmonics. Their first view
+            those that are made; their light side is in harmonics if light is. Their first view
             functions must be constants where any part has a Lambertian or a translucent side: one,
-            or three where their colours differ.
+            or three where their colours differ (one, for bounces of spherical harmonics).
         max_bounces: Most bounces between points; 0 for direct light only.
         tolerance: A bounce that adds less than this share of the exit radiance is the last.
         resolution: Texels along an edge of a face of the visibility cube.
@@ -96,29 +109,23 @@ def bake(
 
     Raises:
         InputError: If the cache cannot be written or is damaged, a part is unknown, bounces are
-            asked for of glossy materials whose light is not in spherical harmonics, the rays are
-            not a multiple of the light's texels, or there are too few rows.
+            asked for of glossy materials whose light is not in spherical harmonics or of coloured
+            factors, the rays are not a multiple of the light's texels, the exit basis does not
+            apply, or there are too few rows.
         ValueError: If ``factors`` do not fit the scene, or it needs none.
     """
     basis = light_basis or SphericalHarmonics(6)
     found, index = assign_materials(mesh, materials)
-    glossy = any(material.glossy for material in found)
-    factored = glossy and not isinstance(basis, SphericalHarmonics)
-    if factored and max_bounces:
-        raise InputError(
-            f"max_bounces: glossy materials bounce light in spherical harmonics, not {basis.name}"
-        )
-    if factors is not None and not factored:
-        raise ValueError("expected factors only of glossy materials without spherical harmonics")
     if isinstance(basis, TexelBasis):
         check_resolution(basis, resolution * supersampling)
     folder = None if cache is None else Path(cache)
     reflectance = _reflectance(mesh, found, index)
-    if factored:
+    if _factored(found, basis, exit_basis, factors):
         if any(material.medium for material in found):  # one reflectance for all terms
             reflectance = torch.ones(1, 3)
-        reflection = _factored(mesh, found, index, reflectance, num_rows, factors, folder)
-    elif glossy:
+        parts = _Parts(mesh, found, index, reflectance)
+        reflection = parts.reflection(basis, num_rows, factors, folder, bounces=max_bounces > 0)
+    elif any(material.glossy for material in found):
         reflection = _glossy(mesh, found, index, num_rows or _HARMONICS)
     else:
         reflection = diffuse_reflection(mesh.num_points)
@@ -180,7 +187,7 @@ class _Scene:
                 self.basis,  # pyright: ignore[reportArgumentType]
                 **shared,
             )
-        if isinstance(self.reflection.exit_basis, HemisphericalHarmonics):
+        if not isinstance(self.reflection.exit_basis, Diffuse):
             return project_glossy(
                 self.mesh,
                 self.visibility,
@@ -236,7 +243,10 @@ def _quality(reflection: Reflection | FactoredReflection) -> dict[str, Any]:
     """What a report says of how well materials are represented."""
     if isinstance(reflection, FactoredReflection):
         return {"unresolved": 0.0, "factor_error": reflection.factors.rms}
-    return {"unresolved": reflection.unresolved}
+    quality: dict[str, Any] = {"unresolved": reflection.unresolved}
+    if isinstance(reflection.exit_basis, BRDFFactors):
+        quality["factor_error"] = reflection.exit_basis.rms
+    return quality
 
 
 def _reflectance(
@@ -276,51 +286,112 @@ def _glossy(mesh: Mesh, materials: list[Material], index: Tensor, num_rows: int)
 
 
 def _factored(
-    mesh: Mesh,
     materials: list[Material],
-    index: Tensor,
-    reflectance: Float[Tensor, "points_or_one rgb"],
-    num_rows: int | None,
+    basis: LightBasis,
+    exit_basis: ExitFunctions | None,
     factors: BRDFFactors | None,
-    cache: Path | None,
-) -> FactoredReflection:
-    """Reflection by BRDF factors.
-
-    Where the Lambertian side of a glossy material has one albedo, it is factored with the rest, so
-    its colour costs no channels. Neither does that of a medium, whose light enters the constants.
-    """
-    diffuse, _ = _sides(materials, index)
-    brdfs, numbers = [], torch.full((len(materials),), -1)
-    for number, material in enumerate(materials):
-        if material.glossy is None:
-            continue
-        numbers[number] = len(brdfs)
-        albedo = mesh.albedo[index == number]
-        if material.lambertian and len(albedo) and bool((albedo == albedo[0]).all()):
-            brdfs.append(Sum((Lambert(tuple(albedo[0].tolist())), material.glossy)))
-            diffuse = diffuse & (index != number)
-        else:
-            brdfs.append(material.glossy)
-    albedo = mesh.albedo.to(torch.float32) * diffuse[:, None]
-    # Where the reflectance that stays a factor is zero, anything may stand beside it: no colour.
-    share = albedo / torch.where(reflectance > 0, reflectance, 1.0)
-    lambertian = colour_channels(torch.where(reflectance > 0, share, diffuse[:, None].to(share)))
-    media = [material.medium for material in materials if material.medium]
-    if not all(medium.is_grey() for medium in media):
-        lambertian = lambertian.expand(-1, 3)
-    elif not media and not bool(lambertian.any()):
-        lambertian = lambertian[:, :0]
-    constants: Any = lambertian.shape[1]
-    if factors is None:
-        num_rows = _FACTORS + max(0, constants - 1) if num_rows is None else num_rows
-        if num_rows < max(1, constants):
-            raise InputError(
-                f"num_rows: the materials need at least {max(1, constants)}, got {num_rows}"
-            )
-        factors = kept_factors(brdfs, num_terms=num_rows, constants=constants, cache=cache)
-    elif (factors.num_materials, factors.num_constants) != (len(brdfs), constants):
-        raise ValueError(
-            f"expected factors of {len(brdfs)} materials with {constants} constants, got "
-            f"{factors.num_materials} with {factors.num_constants}"
+) -> bool:
+    """Whether exit radiance is expanded in BRDF factors; checks that what was asked for applies."""
+    harmonic = isinstance(basis, SphericalHarmonics)
+    glossy = any(material.glossy for material in materials)
+    if exit_basis == "harmonics" and not harmonic:
+        raise InputError(
+            f"exit_basis: harmonics need light in spherical harmonics, not {basis.name}"
         )
-    return FactoredReflection(factors, numbers[index], lambertian)
+    if exit_basis == "factors" and not glossy:
+        raise InputError("exit_basis: factors are of glossy materials, and the scene has none")
+    if factors is not None and (not glossy or exit_basis == "harmonics"):
+        raise ValueError("expected factors only of glossy materials whose exit basis they are")
+    if factors is not None and harmonic and factors.light_order is None:
+        raise ValueError(
+            "expected factors only of glossy materials without spherical harmonics, or with a "
+            "light side in them (method='harmonic')"
+        )
+    return glossy and (not harmonic or exit_basis == "factors" or factors is not None)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What reflection by BRDF factors is made from."""
+
+    mesh: Mesh
+    materials: list[Material]
+    index: Tensor
+    reflectance: Float[Tensor, "points_or_one rgb"]
+
+    def reflection(
+        self,
+        basis: LightBasis,
+        num_rows: int | None,
+        factors: BRDFFactors | None,
+        cache: Path | None,
+        *,
+        bounces: bool,
+    ) -> Reflection | FactoredReflection:
+        """Reflection of light in this basis by the factors given, or by some that are made."""
+        harmonic = isinstance(basis, SphericalHarmonics)
+        if bounces and not harmonic:
+            raise InputError(
+                "max_bounces: glossy materials bounce light in spherical harmonics, "
+                f"not {basis.name}"
+            )
+        brdfs, own, lambertian, constants = self.sides(coloured=not bounces)
+        if bounces and any(brdf.num_channels == 3 for brdf in brdfs):
+            raise InputError(
+                "max_bounces: BRDF factors of coloured materials bounce no light; "
+                "hemispherical harmonics do"
+            )
+        order = max(basis.order, _LEAST_LIGHT_BANDS) if harmonic else None
+        unresolved = 0.0
+        if factors is None:
+            num_rows = _FACTORS + max(0, constants - 1) if num_rows is None else num_rows
+            if num_rows < max(1, constants):
+                raise InputError(
+                    f"num_rows: the materials need at least {max(1, constants)}, got {num_rows}"
+                )
+            factors, unresolved = kept_factors(
+                brdfs, num_terms=num_rows, constants=constants, cache=cache, light_order=order
+            )
+        elif (factors.num_materials, factors.num_constants) != (len(brdfs), constants):
+            raise ValueError(
+                f"expected factors of {len(brdfs)} materials with {constants} constants, got "
+                f"{factors.num_materials} with {factors.num_constants}"
+            )
+        if harmonic:
+            return factored_reflection(factors, own, lambertian, unresolved=unresolved)
+        return FactoredReflection(factors, own, lambertian)
+
+    def sides(self, *, coloured: bool) -> tuple[list[BRDF], Tensor, Tensor, Any]:
+        """The materials to factor, that of each point, Lambertian albedo, number of constants.
+
+        Where the Lambertian side of a glossy material has one albedo, it is factored with the rest,
+        so its colour costs no channels. Neither does that of a medium, whose light enters the
+        constants. If view functions may not be ``coloured``, only grey sides are, and other colours
+        make channels.
+        """
+        diffuse, _ = _sides(self.materials, self.index)
+        brdfs, numbers = [], torch.full((len(self.materials),), -1)
+        for number, material in enumerate(self.materials):
+            if material.glossy is None:
+                continue
+            numbers[number] = len(brdfs)
+            albedo = self.mesh.albedo[self.index == number]
+            alike = len(albedo) > 0 and bool((albedo == albedo[0]).all())
+            if material.lambertian and alike and (coloured or len(albedo[0].unique()) == 1):
+                brdfs.append(Sum((Lambert(tuple(albedo[0].tolist())), material.glossy)))
+                diffuse = diffuse & (self.index != number)
+            else:
+                brdfs.append(material.glossy)
+        albedo = self.mesh.albedo.to(torch.float32) * diffuse[:, None]
+        # Where the reflectance that stays a factor is zero, anything may stand beside it: no colour
+        share = albedo / torch.where(self.reflectance > 0, self.reflectance, 1.0)
+        share = torch.where(self.reflectance > 0, share, diffuse[:, None].to(share))
+        lambertian = colour_channels(share)
+        media = [material.medium for material in self.materials if material.medium]
+        if not media and not bool(lambertian.any()):
+            return brdfs, numbers[self.index], lambertian[:, :0], 0
+        if not coloured:
+            return brdfs, numbers[self.index], lambertian, 1
+        if not all(medium.is_grey() for medium in media):
+            lambertian = lambertian.expand(-1, 3)
+        return brdfs, numbers[self.index], lambertian, lambertian.shape[1]

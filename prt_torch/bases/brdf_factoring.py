@@ -205,15 +205,22 @@ def leading_eigenpairs(
 
 
 def harmonic_factors(
-    target: Target, hemisphere: HemisphereMap, num_terms: int, order: int
+    target: Target,
+    hemisphere: HemisphereMap,
+    num_terms: int,
+    order: int,
+    *,
+    constants: int = 0,
 ) -> Factors:
     """Singular value decomposition of views by spherical harmonics of the light.
 
     Args:
-        target: One material, with the cosine.
+        target: Materials, with the cosine.
         hemisphere: The texels of the view side; the lights of its quadrature serve the integral.
-        num_terms: Rows.
+        num_terms: Rows in all.
         order: Bands of the light side.
+        constants: How many view functions, the first ones, are constants: 1 in any colour, or 3 in
+            red, green and blue. The other rows are the best beside them.
 
     Raises:
         ValueError: If the target lacks the cosine.
@@ -230,14 +237,54 @@ def harmonic_factors(
     for _, values in target.blocks(views[used], lights):
         projected.append(values @ weighted)
         energy += float((values.square() @ solid_angles).sum())  # what no harmonic holds included
-    matrix = torch.cat(projected)  # views, colours, materials, harmonics
-    colours, materials = matrix.shape[1:3]
-    left, singular, right = leading_triplets(
-        matrix.transpose(0, 1).flatten(2).flatten(0, 1), num_terms
+    return decomposed(torch.cat(projected), energy, hemisphere, num_terms, constants=constants)
+
+
+def decomposed(
+    projected: Float[Tensor, "views colours materials harmonics"],
+    energy: float,
+    hemisphere: HemisphereMap,
+    num_terms: int,
+    *,
+    constants: int = 0,
+) -> Factors:
+    """The best factors of light projected onto harmonics for each view.
+
+    Args:
+        projected: Inner products over the upper hemisphere of BRDF times cosine with the harmonics,
+            for the texel centres that have a direction.
+        energy: Squared norm of what was projected, over texels and lights.
+        hemisphere: The texels of the view side.
+        num_terms: Rows in all.
+        constants: As for :func:`harmonic_factors`. The rows beside them are free of the mean over
+            views, which is the constants' own.
+
+    Returns:
+        Light functions as inner products with the harmonics over the upper hemisphere.
+
+    Source:
+        Sloan et al. 2005, equation 14. Constants are ours.
+    """
+    between = projected.transpose(0, 1)
+    scale = 1.0
+    if constants == 3:
+        scale = 3.0 / len(between)
+        between = between.expand(3, -1, -1, -1)
+    colours, texels, materials, _ = between.shape
+    matrix = between.flatten(2).flatten(0, 1)
+    tints = torch.eye(3) if constants == 3 else torch.ones(constants, colours)
+    tints = tints.double()
+    ones = torch.kron(tints, torch.ones(texels, dtype=torch.float64))  # constants; views of colours
+    squares = ones.square().sum(1, keepdim=True)
+    even = ones @ matrix / squares  # the light functions that go best with them
+    left, singular, right = leading_triplets(matrix - ones.mT @ even, num_terms - constants)
+    view = torch.cat(
+        [tints[..., None].expand(-1, -1, texels), left.mT.unflatten(1, (colours, texels))]
     )
-    view = fill(left.mT.unflatten(1, (colours, -1)), used, hemisphere)
-    light = (right * singular).mT.unflatten(1, (materials, -1)).transpose(0, 1)
-    return Factors(view, light, singular.square(), energy)
+    light = torch.cat([even, (right * singular).mT]).unflatten(1, (materials, -1)).transpose(0, 1)
+    energies = torch.cat([(squares * even.square()).sum(1), singular.square()])
+    _, used = hemisphere.centres()
+    return Factors(fill(view, used, hemisphere), light, energies, energy * scale)
 
 
 def fill(

@@ -125,7 +125,7 @@ class BRDFFactors(nn.Module, ExitBasis):
             light_order: Bands of the light side of ``harmonic``.
             constants: How many view functions, the first ones, are constants, so that diffuse light
                 can enter the rows exactly: 1 in any colour, or 3 in red, green and blue. The other
-                rows are the best beside them; ``interpolated`` only.
+                rows are the best beside them; ``interpolated`` and ``harmonic`` only.
 
         Raises:
             ValueError: If an argument is out of range, or not exactly one of ``num_terms`` and
@@ -133,8 +133,10 @@ class BRDFFactors(nn.Module, ExitBasis):
         """
         if (num_terms is None) == (max_error is None):
             raise ValueError("expected exactly one of num_terms and max_error (num_terms=None)")
-        if constants and method != "interpolated":
-            raise ValueError(f"expected the method interpolated for constants, got {method!r}")
+        if constants and method not in ("interpolated", "harmonic"):
+            raise ValueError(
+                f"expected the method interpolated for constants, or harmonic, got {method!r}"
+            )
         if num_terms is not None and not max(1, constants) <= num_terms <= _MOST_TERMS:
             raise ValueError(
                 f"expected {max(1, constants)} to {_MOST_TERMS} terms, got {num_terms}"
@@ -160,20 +162,28 @@ class BRDFFactors(nn.Module, ExitBasis):
             case "symmetric":
                 found = symmetric_factors(target, hemisphere, count)
             case "harmonic":
-                found = harmonic_factors(target, hemisphere, count, light_order)
+                found = harmonic_factors(
+                    target, hemisphere, count, light_order, constants=constants
+                )
             case _:
                 raise ValueError(f"expected a method of {get_args(Method)}, got {method!r}")
         if max_error is not None:
             found = _enough(found, max_error, max(1, constants))
         order = light_order if method == "harmonic" else None
-        factors = cls(
-            found.view,
-            found.light,
-            hemisphere,
-            cosine=target.cosine,
-            light_order=order,
-            num_constants=constants,
+        return cls.of(
+            found, hemisphere, cosine=target.cosine, light_order=order, num_constants=constants
         )
+
+    @classmethod
+    def of(cls, found: Factors, hemisphere: HemisphereMap, **options: Any) -> "BRDFFactors":
+        """Factors that a decomposition has found, with the error that it expects.
+
+        Args:
+            found: Maps, and what they explain.
+            hemisphere: The map that texels are of.
+            **options: Those of the constructor.
+        """
+        factors = cls(found.view, found.light, hemisphere, **options)
         factors.rms = _relative_error(found)[-1]
         return factors
 
