@@ -109,7 +109,8 @@ def full_scale(
 def rounded_up(steps: Float[Tensor, "..."], dtype: torch.dtype) -> Float[Tensor, "..."]:
     """Steps in another type, no smaller than they were, so that what they cover stays covered."""
     rounded = steps.to(dtype)
-    return torch.where(rounded.double() < steps, rounded.nextafter(rounded + rounded), rounded)
+    above = rounded.nextafter(torch.full_like(rounded, math.inf))
+    return torch.where(rounded.double() < steps, above, rounded)
 
 
 def straight_through(

@@ -80,8 +80,9 @@ def frame_from_normal(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
 
     With :math:`n = (x, y, z)` the tangent is
     :math:`(1 - x^2/(1+y),\; -x,\; -xz/(1+y))` and the bitangent :math:`n \times t`. It is smooth
-    everywhere but at :math:`n = (0, -1, 0)`, where the tangent is defined as +x. Below the
-    equator :math:`1/(1+y)` is evaluated as :math:`(1-y)/(x^2+z^2)`, which loses no digits.
+    everywhere but at :math:`n = (0, -1, 0)`, where the tangent is defined as +x, and so near to it
+    (3e-10 in float32, 1e-77 in float64) that slopes would overflow. Below the equator
+    :math:`1/(1+y)` is evaluated as :math:`(1-y)/(x^2+z^2)`, which loses no digits.
 
     Gradients are finite everywhere, the pole included.
 
@@ -90,7 +91,8 @@ def frame_from_normal(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
     """
     x, y, z = normal.unbind(-1)
     equatorial = x * x + z * z
-    pole = (y < 0) & (equatorial == 0)
+    # Slopes divide by the square of this, which must not underflow.
+    pole = (y < 0) & (equatorial < math.sqrt(torch.finfo(normal.dtype).tiny))
     below = (1 - y) / torch.where(pole | (y >= 0), torch.ones_like(equatorial), equatorial)
     above = 1 / (1 + torch.where(y < 0, torch.zeros_like(y), y))
     scale = torch.where(y < 0, below, above)
