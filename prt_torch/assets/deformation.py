@@ -262,15 +262,9 @@ def _second_moments(
     other_tangents: Float64[Tensor, "rings 2 3"],
 ) -> Float64[Tensor, "*poses rings 2 2"]:
     """Sums of products of edges in tangent coordinates, over both edges at each corner."""
-    products = [
-        own[..., :, None] * other[..., None, :]
-        for own, other in zip(
-            (edges, edges.roll(1, dims=-2)),
-            (other_edges, other_edges.roll(1, dims=-2)),
-            strict=True,
-        )
-    ]
-    total = ring.sum((products[0] + products[1]).flatten(-2)).unflatten(-1, (3, 3))
+    products = (edges[..., :, None] * other_edges[..., None, :]).flatten(-2)
+    # An edge lies at both corners that it joins.
+    total = ring.sum(products + products.roll(1, dims=-2)).unflatten(-1, (3, 3))
     return tangents @ total @ other_tangents.mT
 
 

@@ -189,7 +189,6 @@ def mesh_from_raw(
     if flip:
         faces, uv = _turned_over(faces, uv)
         normals = None if normals is None else -normals
-    side = -defects.side if flip else defects.side
     geometry = face_geometry(vertices, faces)
     used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
     counts = {
@@ -198,7 +197,7 @@ def mesh_from_raw(
         "duplicate_faces": defects.duplicate_faces,
         "open_boundary": defects.open_edges,
         "non_manifold_edges": defects.non_manifold_edges,
-        "inward_normals": len(faces) if side < 0 else 0,
+        "inward_normals": len(faces) if (-defects.side if flip else defects.side) < 0 else 0,
         "flipped": len(faces) if flip and orientation == "outward" else 0,
     }
     computed = vertex_normals(geometry, faces, len(vertices))

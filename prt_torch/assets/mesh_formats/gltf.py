@@ -32,8 +32,9 @@ class Points:
     vertices: Float64[np.ndarray, "points 3"]
     normals: Float64[np.ndarray, "points 3"]
     albedo: Float64[np.ndarray, "points 3"]
-    faces: list[Int64[np.ndarray, "faces 3"]]
-    uv: list[Float64[np.ndarray, "faces 3 2"]]
+    faces: list[Int64[np.ndarray, "_ 3"]]
+    """Of each primitive."""
+    uv: list[Float64[np.ndarray, "_ 3 2"]]
     """Of corners, v up; NaN where there are none."""
     attributes: list[dict[str, int]]
     """Accessors of each primitive."""
