@@ -12,9 +12,9 @@ from torch import nn
 from prt_torch.bases import CubeDirections, SphericalHarmonics, sh, zonal
 from prt_torch.bases.zonal_table import LatLongTable
 from prt_torch.fitting import fit
-from prt_torch.representations import DenseTransfer, ZonalLobes, load, save
+from prt_torch.representations import DenseTransfer, ZonalLobes, load, save, zonal_lobes_search
 from prt_torch.representations.zonal_lobes_descent import descend
-from prt_torch.representations.zonal_lobes_objective import LobeObjective
+from prt_torch.representations.zonal_lobes_objective import Anchors, LobeObjective
 from prt_torch.representations.zonal_lobes_search import search
 from prt_torch.sphere import frame_from_normal
 from prt_torch.transfer import TransferTensor
@@ -70,24 +70,73 @@ class TestContract(Contract):
         assert relative(self.make_lossless(transfer).dense(), transfer.dense()) < 1e-7
 
 
+def columns(axes: torch.Tensor, band: int) -> torch.Tensor:
+    """A band's harmonics of lobes of norm one around axes "lobes 3"."""
+    units = axes / axes.norm(dim=1, keepdim=True)
+    own = slice(band * band, (band + 1) ** 2)
+    return sh.evaluate(units, ORDER)[:, own].mT * math.sqrt(4 * math.pi / (2 * band + 1))
+
+
 @pytest.mark.parametrize(("lobes", "first_band"), [(1, 1), (2, 1), (4, 2), (6, 2)])
-def test_objective_and_gradient_against_least_squares_and_autograd(lobes, first_band):
+def test_objective_against_least_squares(lobes, first_band):
     functions, ridge = random_functions(5), 1e-4
-    axes = 1.7 * random_directions(lobes, 5).movedim(1, 2).contiguous().requires_grad_()
+    axes = 1.7 * random_directions(lobes, 5).movedim(1, 2).contiguous()
     at = LobeObjective(functions, first_band, ridge).evaluate(axes)
-    (gradient,) = torch.autograd.grad(at.objective.sum(), axes)
-    assert torch.allclose(at.gradient, gradient, atol=1e-12)
     for number, function in enumerate(functions):
         total = 0.0
         for band in range(first_band, ORDER):
-            own = slice(band * band, (band + 1) ** 2)
-            units = (axes[..., number] / 1.7).detach()
-            columns = sh.evaluate(units, ORDER)[:, own].mT * math.sqrt(4 * math.pi / (2 * band + 1))
-            damped = torch.cat([columns, math.sqrt(ridge) * torch.eye(lobes, dtype=torch.float64)])
-            wanted = nn.functional.pad(function[own], (0, lobes))
+            lobed = columns(axes[..., number], band)
+            damped = torch.cat([lobed, math.sqrt(ridge) * torch.eye(lobes, dtype=torch.float64)])
+            wanted = nn.functional.pad(function[band * band : (band + 1) ** 2], (0, lobes))
             best = torch.linalg.lstsq(damped, wanted, driver="gelsd").solution
             total += float((damped @ best - wanted).square().sum())
-        assert float(at.objective[number].detach()) == pytest.approx(total, abs=1e-12)
+        assert float(at.objective[number]) == pytest.approx(total, abs=1e-12)
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize(("lobes", "first_band"), [(1, 1), (4, 2)])
+def test_slope_against_autograd_and_curvature_against_projection(lobes, first_band, held):
+    functions, ridge = random_functions(3), 1e-4
+    axes = random_directions(lobes, 3).movedim(1, 2).contiguous().requires_grad_()
+    objective = LobeObjective(functions, first_band, ridge)
+    stiffness = torch.rand(lobes, 3, dtype=torch.float64)
+    anchors = Anchors(
+        axes=0.8 * random_directions(lobes, 3, seed=9).movedim(1, 2),
+        weights=torch.randn(ORDER - first_band, lobes, 3, dtype=torch.float64),
+        stiffness=stiffness,
+    )
+    objective = objective.anchored(anchors) if held else objective
+    at = objective.evaluate(axes)
+    (gradient,) = torch.autograd.grad(at.objective.sum(), axes)
+    slope = 0.5 * (at.tangents * gradient[:, None]).sum(2).flatten(0, 1)
+    assert torch.allclose(at.slope, slope, atol=1e-12)
+    for number in range(3):
+        tangents = at.tangents.detach()[..., number].transpose(1, 2)  # lobes 3 turns
+        expected = torch.zeros(2 * lobes, 2 * lobes, dtype=torch.float64)
+        for index, band in enumerate(range(first_band, ORDER)):
+            own = axes.detach()[..., number]
+            weights = at.weights.detach()[index, :, number]
+            moved = torch.autograd.functional.jacobian(
+                lambda s, band=band, weights=weights: columns(s, band) @ weights, own
+            )
+            turned = torch.einsum("kin,nia->kna", moved.transpose(1, 2), tangents).flatten(1)
+            root = math.sqrt(ridge) * torch.eye(lobes, dtype=torch.float64)
+            lobed = torch.cat([columns(own, band), root])
+            turned = nn.functional.pad(turned, (0, 0, 0, lobes))
+            left = turned - lobed @ torch.linalg.lstsq(lobed, turned).solution
+            expected += left.mT @ left
+        if held:
+            expected += stiffness[:, number].repeat_interleave(2).diag()
+        assert torch.allclose(at.curvature[..., number].detach(), expected, atol=1e-10)
+
+
+def test_descent_goes_down_to_where_the_slope_is_zero():
+    functions = random_functions(20)
+    objective = LobeObjective(functions, 2, 1e-7)
+    begin = random_directions(3, 20).movedim(1, 2).contiguous()
+    found = descend(objective, begin, max_steps=200, tolerance=1e-12)
+    assert bool((found.fits.objective < objective.evaluate(begin).objective).all())
+    assert float(found.fits.slope.abs().max()) < 1e-5
 
 
 def reference(functions: torch.Tensor, lobes: int, starts: int) -> torch.Tensor:
@@ -101,11 +150,18 @@ def reference(functions: torch.Tensor, lobes: int, starts: int) -> torch.Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lobes", [1, 2, 3, 4])
+@pytest.mark.parametrize("lobes", [1, 2, 3, 4, 5])
 def test_48_functions_are_fitted_as_well_as_by_200_random_starts(lobes):
     functions = random_functions(48)
     ours, theirs = errors(functions, lobes), reference(functions, lobes, 200)
+    fast = errors(functions, lobes, effort="fast")
+    print(f"{lobes} lobes: {ours.mean():.5f}, {theirs.mean():.5f}, fast {fast.mean():.5f}")
     assert float(ours.mean()) < 1.03 * float(theirs.mean())
+
+
+@pytest.mark.slow
+def test_48_functions_are_met_by_six_lobes():
+    assert float(errors(random_functions(48), 6).max()) < 1e-6
 
 
 @pytest.mark.parametrize(("lobes", "mean"), [(1, 0.749), (2, 0.5225), (3, 0.312), (4, 0.131)])
@@ -117,7 +173,7 @@ def test_few_functions_are_fitted_as_well_as_by_many_random_starts(lobes, mean):
 
 
 def test_six_lobes_are_exact():
-    assert float(errors(random_functions(12), 6).max()) < 1e-5
+    assert float(errors(random_functions(4), 6).max()) < 1e-6
 
 
 def test_more_lobes_are_better_and_fast_is_worse():
@@ -274,10 +330,35 @@ def test_the_ridge_keeps_pairs_from_growing():
 
 
 def test_fitted_together_or_alone():
+    """A function's fit depends on the others, but two lobes are found either way."""
     functions = random_functions(2, seed=7)
     together = errors(functions, 2)
     alone = torch.cat([errors(one[None], 2) for one in functions])
     assert torch.allclose(together, alone, atol=1e-4)
+
+
+def alike_functions(count: int) -> torch.Tensor:
+    """A path of functions, each like the one before."""
+    ends = random_functions(2, seed=4)
+    shares = torch.linspace(0.0, 1.0, count, dtype=torch.float64)[:, None]
+    return (1 - shares) * ends[0] + shares * ends[1]
+
+
+def test_alike_functions_help_each_other():
+    functions = alike_functions(40)
+    together = errors(functions, 4, effort="fast")
+    alone = torch.cat([errors(one[None], 4, effort="fast") for one in functions[::4]])
+    assert float(together[::4].mean()) < 0.95 * float(alone.mean())
+
+
+def test_functions_of_several_pools(monkeypatch):
+    functions = alike_functions(60)
+    functions[7] = 0.0
+    whole = errors(functions, 2)
+    monkeypatch.setattr(zonal_lobes_search, "_POOL", 16)
+    pooled = errors(functions, 2)
+    assert float(pooled[7]) == 0.0
+    assert float((pooled - whole).abs().mean()) < 0.02 * float(whole.mean())
 
 
 def test_scale_does_not_matter():
@@ -326,6 +407,8 @@ def test_orders_without_bands_for_lobes(order):
 def test_refinement_by_gradients_lowers_the_error():
     transfer = harmonic_transfer(random_functions(20).float())
     model = ZonalLobes.from_transfer(transfer, num_lobes=3, effort="fast", bits=None)
+    with torch.no_grad():
+        model.axes += 0.03 * random_directions(20, 1, 3)
     before = (model.dense() - transfer.dense()).detach().norm()
     fit(model, transfer, max_steps=5)
     assert float((model.dense() - transfer.dense()).detach().norm()) < float(before)
@@ -366,7 +449,7 @@ def test_a_search_says_what_it_took():
         effort="fast",
         generator=torch.Generator().manual_seed(0),
     )
-    assert found.starts == 12
+    assert found.starts == 6
     assert found.steps > found.starts
     lengths = found.axes.norm(dim=-1)
     assert torch.allclose(lengths, torch.ones_like(lengths))

@@ -104,7 +104,7 @@ def _high_bands(
     by_channel = harmonics.unflatten(1, split)
     weights = lobes.coefficients.unflatten(1, split)
     order = sh.order_of(light)
-    total = torch.zeros((), dtype=light.dtype, device=light.device)
+    total = light.new_zeros(len(light), len(weights), *weights.shape[1:3])
     for index, band in enumerate(range(order - weights.shape[-1], order)):
         own = slice(band * band, (band + 1) ** 2)
         at_axes = _met(by_channel[..., own], light[..., own])
