@@ -195,8 +195,9 @@ def _left_out(
 ) -> list[dict[str, Any]]:
     """What this scene does not need, why, and what leaving it out saved."""
     mesh, values = inputs.mesh, transfer.num_bytes - transfer.surface.reflectance.nbytes
-    left_out = _left_out_light(transfer)
-    if transfer.num_channels == 1:
+    needless = transfer.provenance.get("left_out", [])
+    left_out = [*_left_out_rays(transfer), *_left_out_light(transfer), *needless]
+    if transfer.num_channels == 1 and not any("channels" in one["what"] for one in needless):
         left_out.append(
             {
                 "what": "two of three colour channels of transfer",
@@ -267,6 +268,20 @@ def _left_out_segments(transfer: TransferTensor, fitted: list[Fitted]) -> list[d
             "saved_bytes": round(shares[0] * values),
         }
     ]
+
+
+def _left_out_rays(transfer: TransferTensor) -> list[dict[str, Any]]:
+    """Points that were proven to see all above their horizon."""
+    made, points = transfer.provenance, transfer.num_points
+    free = made.get("free_points", 0)
+    why = "no face reaches above their tangent planes, so nothing hides the sky from them"
+    if not free:
+        return []
+    if not made["rays"]:
+        saved = points * made["bits_bytes"]
+        return [{"what": "all rays and visibility bits", "why": why, "saved_bytes": saved}]
+    saved = made["visibility_seconds"] * free / (points - free)
+    return [{"what": f"rays of {free} of {points} points", "why": why, "saved_seconds": saved}]
 
 
 def _left_out_light(transfer: TransferTensor) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ each. A run that was killed goes on where it stopped when it is started again.
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from prt_torch.errors import InputError
 from prt_torch.fitting import fit
 from prt_torch.gallery import file_name
 from prt_torch.inputs import Inputs, load_inputs
+from prt_torch.inspection import leave_out
 from prt_torch.metric import Metric
 from prt_torch.report import summary_table
 from prt_torch.representations import (
@@ -65,7 +67,9 @@ def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]
     out = run_folder(config)
     with store.locked(out, what="output folder"):
         _check_folder(out, config, inputs)
-        transfer = _bake(config, inputs, console)
+        transfer = _needed(config, _bake(config, inputs, console))
+        if transfer.surface.light_basis is not None:  # lights are projected to what transfer has
+            inputs = replace(inputs, light_basis=transfer.surface.light_basis)
         store.write_bytes(out / CONFIG, _claim(config, inputs).encode())
         fitted = _fit_all(out, config, inputs, transfer, console)
         console.print("evaluating and drawing ...")
@@ -165,6 +169,7 @@ def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor
             tolerance=config.transfer.tolerance,
             resolution=config.transfer.resolution,
             supersampling=config.transfer.supersampling,
+            trace_all="rays" in config.transfer.keep,
             cache=config.cache,
             memory_budget=config.memory_budget,
             stages=stage,
@@ -177,6 +182,17 @@ def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor
             soft_wrap=True,
         )
     return transfer
+
+
+def _needed(config: RunConfig, transfer: TransferTensor) -> TransferTensor:
+    """Transfer without what the scene does not need; its provenance says what that was."""
+    transfer, findings = leave_out(
+        transfer,
+        error=config.transfer.needless,
+        force=[part for part in config.transfer.keep if part != "rays"],
+    )
+    entries = [found.entry() for found in findings if found.left_out]
+    return replace(transfer, provenance={**transfer.provenance, "left_out": entries})
 
 
 def _progress(console: Console) -> Progress:

@@ -85,6 +85,12 @@ class TransferConfig(_Section):
     rows: int | None = Field(
         None, ge=2, le=64, description="exit functions; null is 24 harmonics, or 10 factors"
     )
+    keep: list[Literal["rays", "channels", "bands"]] = Field(
+        default_factory=list, description="what is kept though the scene does not need it"
+    )
+    needless: float = Field(
+        1e-3, ge=0, lt=1, description="squared error of transfer that counts as no need"
+    )
     max_bounces: int = Field(0, ge=0, le=64, description="0 is direct light only")
     tolerance: float = Field(1e-3, ge=0, lt=1, description="share of the light of a last bounce")
 

@@ -142,7 +142,7 @@ def kill_and_resume(
     finish(start(folder, announced, script, given))
 
 
-TIMES = {"seconds", "fit_seconds", "relight_seconds", "dense_seconds", "cached"}
+TIMES = {"seconds", "fit_seconds", "saved_seconds", "relight_seconds", "dense_seconds", "cached"}
 
 
 def without_times(value: Any) -> Any:

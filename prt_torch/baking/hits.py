@@ -116,6 +116,8 @@ class HitFinder:
 
     def nothing_hidden(self) -> bool:
         """Whether every point sees the sky in all directions above its horizon."""
+        if self._visibility.hides_nothing:
+            return True
         everything = slice(0, self._mesh.num_points)
         return not any(bool(self._hidden(block).any()) for block in self.blocks(everything))
 

@@ -74,6 +74,8 @@ def project_points(
     provenance = {
         "inputs": described,
         "rays": visibility.rays,
+        "free_points": visibility.free_points,
+        "bits_bytes": visibility.bits.shape[1],
         "visibility_seconds": visibility.seconds,
         "projection_seconds": built.counts["seconds"],
         "visibility_cached": visibility.cached,

@@ -72,6 +72,7 @@ def bake(
     tolerance: float = 1e-3,
     resolution: int = 32,
     supersampling: int = 4,
+    trace_all: bool = False,
     cache: Path | str | None = None,
     memory_budget: int = 4 * 2**30,
     stages: Stages | None = None,
@@ -98,6 +99,7 @@ def bake(
         tolerance: A bounce that adds less than this share of the exit radiance is the last.
         resolution: Texels along an edge of a face of the visibility cube.
         supersampling: Rays along an edge of a texel.
+        trace_all: Trace points that are proven to see all above their horizon, too.
         cache: Folder that keeps bakes by the hash of their inputs; a killed bake resumes from it.
             Without one, bits and values stay in memory.
         memory_budget: Bytes that one block of the computation may take.
@@ -134,6 +136,7 @@ def bake(
         mesh,
         resolution=resolution,
         supersampling=supersampling,
+        trace_all=trace_all,
         cache=folder,
         progress=tell("trace visibility"),
     )
