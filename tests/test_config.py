@@ -16,7 +16,11 @@ from prt_torch.settings import RunConfig
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 COMPLETE = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
 GROUPS = ("scene", "material", "light", "transfer", "representation", "fit", "preview")
-IN_GROUPS = sorted((path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yaml"))
+IN_GROUPS = sorted(
+    (path.parent.name, path.stem)
+    for path in CONFIGS.glob("*/*.yaml")
+    if path.parent.name != "sweep"  # of train/sweep.py: tests/test_sweep.py
+)
 REPRESENTATIONS = sorted(stem for group, stem in IN_GROUPS if group == "representation")
 
 
