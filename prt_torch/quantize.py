@@ -128,21 +128,27 @@ def straight_through(
     Raises:
         ValueError: If ``bits`` is out of range.
     """
-    return _StraightThrough.apply(values, step, largest_code(bits))  # pyright: ignore[reportReturnType]
+    steps = torch.as_tensor(step, device=values.device)
+    return _StraightThrough.apply(values, steps, largest_code(bits))  # pyright: ignore[reportReturnType]
 
 
 class _StraightThrough(torch.autograd.Function):
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx: Any, values: Tensor, step: Tensor | float, limit: int) -> Tensor:
-        scaled = values.double() / step
-        if ctx.needs_input_grad[0]:
-            ctx.save_for_backward(scaled.abs() <= limit + 0.5)
-        codes = scaled.round_().clamp_(-limit, limit).add_(0.0)  # as integers: no negative zero
-        return codes.mul_(step).to(values.dtype)
+    def forward(values: Tensor, step: Tensor, limit: int) -> Tensor:
+        codes = (values.double() / step).round_().clamp_(-limit, limit)
+        return ((codes + 0.0) * step).to(values.dtype)  # as integers: no negative zero
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
+        values, step, ctx.limit = inputs
+        ctx.save_for_backward(values, step)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        (inside,) = ctx.saved_tensors
+        values, step = ctx.saved_tensors
+        inside = (values.double() / step).abs() <= ctx.limit + 0.5
         return gradients[0].where(inside, 0.0), None, None
 
 

@@ -171,6 +171,7 @@ def _towards(
     rows: Float[Tensor, "views points rows"] | Float[Tensor, "views points rows rgb"],
 ) -> Float[Tensor, "batch views points rgb"]:
     """Rows of radiance times what each view sees of them."""
+    rows = rows.to(radiance)  # views may have another type than light
     if rows.ndim == 3:
         by_point = radiance.permute(1, 2, 3, 0).flatten(2)  # points, rows, rgb * batch
         seen = torch.bmm(rows.transpose(0, 1), by_point)  # points, views, rgb * batch

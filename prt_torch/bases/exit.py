@@ -1,6 +1,5 @@
 """Exit bases: how radiance leaves a point."""
 
-import functools
 import math
 from typing import Any
 
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from prt_torch.bases import sh
 from prt_torch.bases.base import ExitBasis
+from prt_torch.bases.tables import kept
 from prt_torch.sphere import to_horizon
 
 _MAX_HEMISPHERICAL = 64  # order 8: condition 3.5e9, still within float64
@@ -119,7 +119,7 @@ class HemisphericalHarmonics(ExitBasis):
         return {}
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def _best_functions(order: int, num_rows: int) -> Int[Tensor, "rows"]:
     """Indices of the harmonics that are left when the best replaced ones are dropped.
 

@@ -17,7 +17,6 @@ without error by Gauss-Legendre nodes in z times equal steps in azimuth, so
 singular rotation, and is differentiable in R.
 """
 
-import functools
 import math
 from typing import Any
 
@@ -27,6 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch.bases.base import LightBasis, Radiance
+from prt_torch.bases.tables import kept
 from prt_torch.conventions import sh_index
 from prt_torch.sphere import cubemap_directions
 
@@ -97,7 +97,7 @@ def _legendre_step(band: int, m: int) -> tuple[float, float]:
     return step, back
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def _product_quadrature(order: int) -> tuple[Tensor, Tensor]:
     """Directions and weights that integrate products of two functions of degree < order exactly."""
     nodes, node_weights = np.polynomial.legendre.leggauss(order)
@@ -298,12 +298,19 @@ class SphericalHarmonics(LightBasis):
 
     def _cube_table(self, resolution: int, like: Tensor) -> Float[Tensor, "texels coeffs"]:
         key = (resolution, like.dtype, like.device)
-        if key not in self._cube_tables:
-            directions = cubemap_directions(resolution, dtype=torch.float64).reshape(-1, 3)
-            rows = max(1, _TABLE_ELEMENTS // self.num_coeffs)
-            pieces = [evaluate(some, self.order).to(like) for some in directions.split(rows)]
-            self._cube_tables = {key: torch.cat(pieces)}
+        if key in self._cube_tables:
+            return self._cube_tables[key]
+        if torch.compiler.is_compiling():  # what is traced holds no numbers to keep
+            return self._made_cube_table(resolution, like)
+        with torch.inference_mode(False):  # so that gradients can pass through it later
+            self._cube_tables = {key: self._made_cube_table(resolution, like)}
         return self._cube_tables[key]
+
+    def _made_cube_table(self, resolution: int, like: Tensor) -> Float[Tensor, "texels coeffs"]:
+        directions = cubemap_directions(resolution, dtype=torch.float64).reshape(-1, 3)
+        rows = max(1, _TABLE_ELEMENTS // self.num_coeffs)
+        pieces = [evaluate(some, self.order).to(like) for some in directions.split(rows)]
+        return torch.cat(pieces)
 
     def gram(self) -> Float[Tensor, "coeffs"]:
         """Ones: the basis is orthonormal."""

@@ -19,7 +19,6 @@ Source:
     Sloan, Luna, Snyder 2005, section 3.4.
 """
 
-import functools
 import math
 from typing import Any
 
@@ -28,6 +27,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from prt_torch.bases import sh
+from prt_torch.bases.tables import kept
 
 _QUARTER = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))  # +y to +z, around x
 
@@ -94,7 +94,7 @@ def quarter_turn_pattern(band: int) -> Bool[Tensor, "m m"]:
     return y_to_z & z_to_y
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def quarter_turn(order: int) -> tuple[Int[Tensor, "2 entries"], Float[Tensor, "entries"]]:
     """Entries of the quarter turn around x of all bands: rows and columns, values in float64.
 
@@ -109,13 +109,13 @@ def quarter_turn(order: int) -> tuple[Int[Tensor, "2 entries"], Float[Tensor, "e
     return torch.stack([rows, columns]), matrix[rows, columns]
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def _degrees_about_z(order: int) -> Int[Tensor, "coeffs"]:
     """The m of each coefficient."""
     return torch.cat([torch.arange(-band, band + 1) for band in range(order)])
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def _partners(order: int) -> Int[Tensor, "coeffs"]:
     """Index of the harmonic of opposite m in the same band."""
     return torch.arange(order * order) - 2 * _degrees_about_z(order)

@@ -28,6 +28,9 @@ class Representation(nn.Module, ABC):
     kind: ClassVar[str]
     """Name in configurations and files."""
 
+    places: ClassVar[tuple[str, ...]] = ()
+    """Buffers that further tables are made of: only a checkpoint that has the same ones fits."""
+
     reflectance: Tensor
 
     def __init__(self, surface: Surface, shape: tuple[int, int, int, int]):
@@ -35,6 +38,7 @@ class Representation(nn.Module, ABC):
         self._surface = surface
         self.num_points, self.num_channels, self.num_rows, self.num_coeffs = shape
         self.register_buffer("reflectance", surface.reflectance)
+        self.register_load_state_dict_pre_hook(_refuse_other_places)
 
     @property
     def surface(self) -> Surface:
@@ -177,11 +181,50 @@ class CodedRepresentation(Representation):
         return self
 
     def _rest(self) -> None:
-        """Remember that the parameters are what a file holds."""
-        self._resting = [(one, one._version) for one in self.parameters(recurse=False)]
+        """Remember that the parameters are what a file holds.
+
+        Nobody counts what is written to tensors of inference mode, so they are never at rest. The
+        reflectance, which a user may make a parameter, is in no code.
+        """
+        own = {n: p for n, p in self.named_parameters(recurse=False) if n != "reflectance"}
+        counted = not any(one.is_inference() for one in own.values())
+        self._resting = {n: (p, p._version) for n, p in own.items()} if counted else {}
 
     @property
     def _at_rest(self) -> bool:
         """Whether no parameter has been replaced or written to since."""
-        pairs = zip(self._resting, self.parameters(recurse=False), strict=True)
-        return all(one is then and one._version == version for (then, version), one in pairs)
+        if torch.compiler.is_compiling():  # a traced answer would never change again
+            return False
+        return bool(self._resting) and all(
+            getattr(self, name) is then and then._version == version
+            for name, (then, version) in self._resting.items()
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """As of any module; versions of tensors do not survive a copy, being at rest does."""
+        return {**self.__dict__, "_resting": self._at_rest}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The inverse of :meth:`__getstate__`."""
+        at_rest = state.pop("_resting")
+        super().__setstate__(state)
+        self._resting = {}
+        if at_rest:
+            self._rest()
+
+
+def _refuse_other_places(
+    module: Representation, state: dict[str, Any], prefix: str, *_: object
+) -> None:
+    """Refuse a checkpoint of other clusters, whose numbers would be given to the wrong points.
+
+    Raises:
+        ValueError: If a buffer of ``places`` differs.
+    """
+    for name in module.places:
+        own, given = module.get_buffer(name), state.get(prefix + name)
+        if given is not None and not torch.equal(given.to(own.device), own):
+            raise ValueError(
+                f"expected a checkpoint with the same {name}, got another clustering "
+                "(representations.save and load keep the clusters)"
+            )

@@ -62,6 +62,7 @@ class ClusteredTensor(CodedRepresentation):
     """
 
     kind: ClassVar[str] = "clustered_tensor"
+    places: ClassVar[tuple[str, ...]] = ("labels", "groups")
     labels: Tensor
     groups: Tensor
     view_basis: nn.Parameter

@@ -50,6 +50,7 @@ class CPCA(Representation):
     """
 
     kind: ClassVar[str] = "cpca"
+    places: ClassVar[tuple[str, ...]] = ("labels", "ranks")
     labels: Tensor
     ranks: Tensor
 
@@ -221,7 +222,7 @@ class CPCA(Representation):
         """
         return nn.functional.embedding_bag(
             self.layout.own_vectors,
-            vectors,
+            vectors.to(self.weights.dtype),  # autocast, which leaves them short, stops here
             self.layout.own_borders,
             mode="sum",
             per_sample_weights=self.layout.mixture(self.weights),

@@ -63,12 +63,13 @@ class ScatteredSRBF(CodedRepresentation):
     """
 
     kind: ClassVar[str] = "scattered_srbf"
+    places: ClassVar[tuple[str, ...]] = ("labels",)
     labels: Tensor
     centers: nn.Parameter
     log_bandwidths: nn.Parameter
     weights: nn.Parameter
     _weight_steps: Tensor | None
-    _functions_at_rest: Tensor | None
+    _functions_at_rest: Tensor | None  # no buffer: processes that have not relit lack it
 
     def __init__(
         self, encoding: ScatteredEncoding, surface: Surface, shape: tuple[int, int, int, int]
@@ -154,7 +155,7 @@ class ScatteredSRBF(CodedRepresentation):
 
     def _rest(self) -> None:
         super()._rest()
-        self.register_buffer("_functions_at_rest", None, persistent=False)
+        self._functions_at_rest = None
 
     def _encoding(self) -> ScatteredEncoding:
         parameters = Parameters(**{name: getattr(self, name) for name in Parameters.names()})
@@ -169,9 +170,12 @@ class ScatteredSRBF(CodedRepresentation):
         refined = values.centers.requires_grad or values.log_bandwidths.requires_grad
         if not at_rest or (refined and torch.is_grad_enabled()):
             return self._in_light_basis(values), values.weights
-        if self._functions_at_rest is None:
-            self._functions_at_rest = self._in_light_basis(values).detach()
-        return self._functions_at_rest, values.weights
+        kept, like = self._functions_at_rest, values.weights
+        if kept is None or (kept.dtype, kept.device) != (like.dtype, like.device):
+            with torch.inference_mode(False):  # so that gradients can pass through them later
+                kept = self._in_light_basis(values).detach()
+            self._functions_at_rest = kept
+        return kept, values.weights
 
     def _in_light_basis(self, values: Parameters) -> Float[Tensor, "clusters n coeffs"]:
         return in_light_basis(self._basis, values.centers, values.log_bandwidths, self.resolution)
@@ -190,12 +194,20 @@ class ScatteredSRBF(CodedRepresentation):
     ) -> Float[Tensor, "batch points rows rgb"]:
         """Light each cluster's functions, then mix them for each point.
 
+        Autocast is switched off: weights of functions that overlap cancel, and bfloat16 would lose
+        a further digit to that.
+
         Raises:
             ValueError: If shapes do not fit, or ``frames`` are given.
         """
         if frames is not None:
             raise ValueError("scattered functions are fixed to the rest pose and cannot be posed")
         local = self._check_light(light)
+        with torch.autocast(light.device.type, enabled=False):
+            return self._relit(light.to(self.weights.dtype), local)
+
+    def _relit(self, light: Tensor, local: bool) -> Float[Tensor, "batch points rows rgb"]:
+        """Radiance in the exit basis under distant light, or each point's own."""
         functions, weights = self._values()
         weights = self.blocks.to_slots(weights)  # slots channels rows n
         if local:

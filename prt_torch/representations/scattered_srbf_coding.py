@@ -9,7 +9,7 @@ Source:
     ours.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -45,7 +45,7 @@ class Parameters:
     @classmethod
     def names(cls) -> list[str]:
         """Of the three parts."""
-        return [field.name for field in fields(cls)]
+        return ["centers", "log_bandwidths", "weights"]
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,7 @@ class SegmentedCPCA(CodedRepresentation):
     """
 
     kind: ClassVar[str] = "segmented_cpca"
+    places: ClassVar[tuple[str, ...]] = ("labels", "ranks", "clusters")
     labels: Tensor
     ranks: Tensor
     clusters: Tensor
@@ -189,7 +190,7 @@ class SegmentedCPCA(CodedRepresentation):
     def _rest(self) -> None:
         """As for all coded representations; and forget how the parameters were lit."""
         super()._rest()
-        self._lit_mixture: LitMixture | None = None
+        self._lit_mixture: tuple[LitMixture, ...] = ()
 
     def _encoding(self) -> Encoding:
         return Encoding(
@@ -228,11 +229,12 @@ class SegmentedCPCA(CodedRepresentation):
         return radiance.permute(3, 0, 1, 2)
 
     def _mixture(self) -> LitMixture:
-        if self._lit_mixture is None:
-            self._lit_mixture = LitMixture(
-                self.segments, self.num_points, self.representatives, self.weights
-            )
-        return self._lit_mixture
+        kept, like = self._lit_mixture, self.weights
+        if not kept or (kept[0].mixture.dtype, kept[0].mixture.device) != (like.dtype, like.device):
+            made = LitMixture(self.segments, self.num_points, self.representatives, self.weights)
+            # In a tuple, not part of the module: processes that have not relit lack it.
+            self._lit_mixture = kept = (made,)
+        return kept[0]
 
     def _forward_by_segment(self, light: Tensor) -> Float[Tensor, "points rows rgb batch"]:
         width = self.num_rows * 3 * len(light)

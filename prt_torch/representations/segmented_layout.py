@@ -63,13 +63,13 @@ class Segment(nn.Module):
         """
         subspaces, raw = vectors.tensor_split([self.num_subspace_vectors])
         if points is None:
-            out.index_add_(0, self.raw_points, raw)
-            out.index_add_(0, self.points, self._mix(subspaces, weights))
+            out.index_add_(0, self.raw_points, raw.to(out.dtype))  # autocast may leave it short
+            out.index_add_(0, self.points, self._mix(subspaces, weights).to(out.dtype))
             return
         places, own = _find(points, self.raw_points)
         out.index_add_(0, places, raw[own])
         places, own = _find(points, self.points)
-        out.index_add_(0, places, self._mix(subspaces, weights, own))
+        out.index_add_(0, places, self._mix(subspaces, weights, own).to(out.dtype))
 
     def _mix(
         self, vectors: Tensor, weights: Tensor, own: Int[Tensor, "some"] | None = None

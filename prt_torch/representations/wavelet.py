@@ -228,11 +228,13 @@ class WaveletTransfer(Representation):
     def _weights(self) -> Float[Tensor, "channels points rows terms"]:
         """Decoded values; those of the last call if nothing has changed and no gradient is due."""
         tracked = torch.is_grad_enabled() and self.values.requires_grad
-        if tracked or torch.compiler.is_compiling():  # a traced version would never change again
+        # A traced version would never change again, and those of inference mode have none.
+        if tracked or torch.compiler.is_compiling() or self.values.is_inference():
             return _decode(self.values, self._coding)
         if self._decoded is None or not self._decoded.is_of(self.values):
             values = self.values.detach()
-            decoded = _decode(values, self._coding).contiguous()
+            with torch.inference_mode(False):  # so that gradients can pass through it later
+                decoded = _decode(values, self._coding).contiguous()
             self._decoded = _Decoded(values, values._version, decoded)
         return self._decoded.weights
 

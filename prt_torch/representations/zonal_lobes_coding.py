@@ -8,7 +8,7 @@ Source:
     Ours; Sloan, Luna, Snyder 2005 store floating-point textures.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -41,7 +41,7 @@ class Lobes:
     @classmethod
     def names(cls) -> list[str]:
         """Of the three parts."""
-        return [field.name for field in fields(cls)]
+        return ["axes", "coefficients", "linear"]
 
     def steps(self) -> Float[Tensor, "points rows"]:
         """The finest steps that clamp nothing, in the type of the coefficients."""
