@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,6 +17,15 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert re.search(r"squared error \d\.\d\de-0[23]", printed)
     assert (tmp_path / "knot.safetensors").exists()
+
+
+def test_the_example_of_a_deforming_surface_runs():
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (block,) = [one for one in blocks if "deformed_frames" in one]
+    names: dict[str, Any] = {}
+    exec(compile(block, "README.md", "exec"), names)
+    assert names["radiance"].shape == (1, 1, names["scene"].num_points, 3)
+    assert bool((names["radiance"] > -0.1).all())
 
 
 @pytest.mark.parametrize("link", re.findall(r"\]\(((?!http)[^)#]+)\)", README.read_text()))
