@@ -164,7 +164,7 @@ def glossy_reflection(
 def factored_reflection(
     factors: BRDFFactors,
     materials: Int[Tensor, "points"],
-    lambertian: Float[Tensor, "points own_channels"],
+    lambertian: Float[Tensor, "points_or_one own_channels"],
     *,
     unresolved: float = 0.0,
 ) -> Reflection:
