@@ -457,8 +457,12 @@ def test_refinement_reaches_the_closed_form_from_any_factors():
     [
         (ANISOTROPIC, {"num_terms": 4}),
         (TINTED, {"num_terms": 8, "constants": 3}),
-        (TINTED, {"num_terms": 2, "method": "symmetric"}),
-        ([GLOSSY, ANISOTROPIC], {"num_terms": 4, "constants": 1, "mapping": "polar"}),
+        pytest.param(TINTED, {"num_terms": 2, "method": "symmetric"}, marks=pytest.mark.slow),
+        pytest.param(
+            [GLOSSY, ANISOTROPIC],
+            {"num_terms": 4, "constants": 1, "mapping": "polar"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_nonnegative(model, options):
@@ -479,7 +483,7 @@ def test_nonnegative(model, options):
     assert again.error_after <= again.error_before == pytest.approx(refined.error_after, rel=1e-6)
 
 
-@pytest.mark.parametrize("model", [ANISOTROPIC, TINTED])
+@pytest.mark.parametrize("model", [ANISOTROPIC, pytest.param(TINTED, marks=pytest.mark.slow)])
 def test_reciprocal(model):
     given = BRDFFactors.from_brdf(
         model, num_terms=4, method="symmetric", mapping="orthographic", resolution=12

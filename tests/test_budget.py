@@ -55,6 +55,7 @@ def tried(name: str):
     return coarse(scene(name), GRIDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ring", "ball"])
 @pytest.mark.parametrize("share", [0.4])
 def test_bytes_within_ten_percent_of_the_best_of_an_exhaustive_grid(name, share):
@@ -68,7 +69,7 @@ def test_bytes_within_ten_percent_of_the_best_of_an_exhaustive_grid(name, share)
     assert choice.tried.error <= 1.1 * best
 
 
-@pytest.mark.parametrize("name", ["ring", "ball"])
+@pytest.mark.parametrize("name", [pytest.param("ring", marks=pytest.mark.slow), "ball"])
 @pytest.mark.parametrize("error", [1e-2])
 def test_error_within_ten_percent_of_the_fewest_bytes(name, error):
     choice = refine(scene(name), Limits(error=error), tried(name))
@@ -105,6 +106,7 @@ def test_reasons_name_the_choice_and_the_others():
     assert all(any(reason.startswith(kind) for reason in choice.why[1:]) for kind in others)
 
 
+@pytest.mark.slow
 def test_same_choice_again():
     limits = Limits(error=0.02)
     first, second = (refine(scene("ball"), limits, tried("ball")) for _ in range(2))

@@ -63,7 +63,7 @@ def test_iterative_beats_static_beats_vector_quantisation():
 
 
 def test_error_falls_with_rank_and_with_clusters():
-    transfer = random_transfer(points=1500, coeffs=25, seed=4)
+    transfer = random_transfer(points=600, coeffs=25, seed=4)
     by_rank = [
         squared_error(CPCA.from_transfer(transfer, num_clusters=8, rank=r), transfer)
         for r in range(5)

@@ -114,7 +114,9 @@ class TestRaggedLinear(_Variant):
         return ragged(transfer, affine=False)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_errors_fall_from_method_to_method_at_equal_storage(seed):
     transfer = groups_of_several_dimensions(seed)
     models = [
@@ -138,7 +140,15 @@ def test_vectors_beat_more_clusters_without_any_at_equal_storage(seed):
 
 
 @pytest.mark.parametrize("affine", [True, False])
-@pytest.mark.parametrize(("clusters", "rank"), [(1, 2), (7, 1), (7, 4), (40, 2), (16, 0)])
+@pytest.mark.parametrize(
+    ("clusters", "rank"),
+    [
+        (1, 2),
+        (7, 1),
+        (16, 0),
+        *(pytest.param(*size, marks=pytest.mark.slow) for size in [(7, 4), (40, 2)]),
+    ],
+)
 def test_adaptive_is_never_larger_nor_worse(affine, clusters, rank):
     rank = rank if affine else max(rank, 1)
     for dtype in (torch.float32, torch.float64):
@@ -441,7 +451,9 @@ def test_the_least_error_within_bytes(method):
     assert tried == 5
 
 
-@pytest.mark.parametrize("max_error", [0.3, 1e-2, 1e-3, 1e-8])
+@pytest.mark.parametrize(
+    "max_error", [0.3, 1e-2, *(pytest.param(e, marks=pytest.mark.slow) for e in (1e-3, 1e-8))]
+)
 def test_the_fewest_bytes_within_an_error(max_error):
     transfer = smooth_transfer(points=600)
     found = CPCA.within(transfer, max_error=max_error)
