@@ -27,7 +27,6 @@ from prt_torch.command import main
 from prt_torch.errors import InputError
 from prt_torch.report.numbers import bytes_text, percent_text, seconds_text
 from prt_torch.report.plots import LIGHT
-from prt_torch.sweep_settings import parse_sweep
 from prt_torch.tradeoff import Result, error_of, fronts, within
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
@@ -77,7 +76,7 @@ def compare(arguments: list[str]) -> None:
     for part in PARTS:
         chosen = [*part.keys, *keys, f"out={out / part.name}"]
         start = time.perf_counter()
-        run = parse_sweep(chosen, CONFIGS, script="eval/comparison.py")
+        run = sweep.parse_sweep(chosen, CONFIGS, script="eval/comparison.py")
         reports.append(sweep.execute(run, console))
         console.print(f"{part.name}: {seconds_text(time.perf_counter() - start)}")
     tables = [_table(part, report) for part, report in zip(PARTS, reports, strict=True)]

@@ -1,7 +1,7 @@
 """Which representation, and with which parameters, for a budget of bytes, error or time.
 
 1. *Coarse*: each family's parameters are swept on a coarse nested grid
-   (:mod:`prt_torch.sweep_nesting`).
+   (:mod:`prt_torch.nesting`).
 2. *Refine*: in the families that may still win, lines through the best are followed: where a value
    of a parameter keeps the limits and the next does not, one between them is fitted, a few times
    over. A family whose best is far above that of another is left as it is.
@@ -23,9 +23,9 @@ import torch
 from prt_torch import evaluate
 from prt_torch.bases import SphericalHarmonics
 from prt_torch.errors import InputError
+from prt_torch.nesting import Parameters, Problem, chains, closed_form, nested
 from prt_torch.relight import Relighter
 from prt_torch.representations import Representation
-from prt_torch.sweep_nesting import Parameters, Problem, chains, closed_form, nested
 from prt_torch.transfer import TransferTensor
 
 Grids = Mapping[str, Mapping[str, Sequence[Any]]]

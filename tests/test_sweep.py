@@ -13,28 +13,31 @@ import trimesh
 from contract import random_transfer
 from rich.console import Console
 
-from prt_torch import InputError, TransferTensor, evaluate, store, sweep, sweep_chain
+from prt_torch import InputError, TransferTensor, evaluate, store, sweep
 from prt_torch.bases import Haar, SphericalHarmonics
 from prt_torch.metric import Metric
-from prt_torch.representations import (
-    CPCA,
-    ClusteredTensor,
-    ScatteredSRBF,
-    SegmentedCPCA,
-    WaveletTransfer,
-)
-from prt_torch.sweep_chain import Kept, run_chain
-from prt_torch.sweep_measure import Judge
-from prt_torch.sweep_nesting import NESTINGS, Chain, Problem, chains, closed_form, nested
-from prt_torch.sweep_reductions import (
+from prt_torch.nesting import NESTINGS, Chain, Problem, chains, closed_form, nested
+from prt_torch.reductions import (
     fewer_functions,
     fewer_segment_vectors,
     fewer_terms,
     fewer_vectors,
     smaller_tensor,
 )
-from prt_torch.sweep_settings import SlurmConfig, parse_sweep
-from prt_torch.sweep_workers import workers
+from prt_torch.representations import (
+    CPCA,
+    ClusteredTensor,
+    ScatteredSRBF,
+    SegmentedCPCA,
+    WaveletTransfer,
+    save,
+)
+from prt_torch.sweep import parse_sweep, planned
+from prt_torch.sweep.chain import Kept, job, run_chain
+from prt_torch.sweep.execution import _outcome
+from prt_torch.sweep.measure import Judge
+from prt_torch.sweep.settings import SlurmConfig
+from prt_torch.sweep.workers import workers
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -265,7 +268,7 @@ def test_killed_chain_ends_as_if_it_had_not_been(tmp_path, monkeypatch, stop_aft
 
     def dies(self, kind, made, worth):
         if len(kept) == stop_after:  # the representation is there, its record is not
-            sweep_chain.save(made.model, self.path(kind, made.parameters))
+            save(made.model, self.path(kind, made.parameters))
             raise KeyboardInterrupt
         kept.append(made)
         keep(self, kind, made, worth)
@@ -400,7 +403,7 @@ def test_a_point_that_is_asked_for_twice_is_named():
     twice = "sweep.representations=[{name: cpca, rank: [1, 2]}, {name: cpca, rank: 2}]"
     config = parse_sweep([twice], CONFIGS, script="train/sweep.py")
     with pytest.raises(InputError, match="cpca 128x2 is asked for twice"):
-        sweep.planned(config)
+        planned(config)
 
 
 def test_one_list_is_one_triple_of_ranks():
@@ -450,7 +453,7 @@ class FakeQueue:
 
 def test_queue_gives_results_and_errors(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "submitit", types.SimpleNamespace(AutoExecutor=FakeQueue))
-    monkeypatch.setattr("prt_torch.sweep_workers._POLL_SECONDS", 0.01)
+    monkeypatch.setattr("prt_torch.sweep.workers._POLL_SECONDS", 0.01)
     given = ["sweep.executor=slurm", "sweep.slurm.partition=night"]
     config = parse_sweep(given, CONFIGS, script="train/sweep.py").sweep
     with workers(config, tmp_path) as executor:
@@ -466,11 +469,11 @@ def test_a_killed_worker_is_one_line():
     future: Future = Future()
     future.set_exception(BrokenExecutor("gone"))
     with pytest.raises(InputError, match=r"sweep.workers: a worker was killed"):
-        sweep._outcome(future)
+        _outcome(future)
 
 
 def test_chains_travel_as_plain_json():
     config = parse_sweep([], CONFIGS, script="train/sweep.py")
     chain = Chain("cpca", {"num_clusters": 4}, "rank", (2, 1))
-    work = sweep_chain.job(config.run, chain, Path("folder"), alone=True)
+    work = job(config.run, chain, Path("folder"), alone=True)
     assert json.loads(json.dumps(work))["chain"]["values"] == [2, 1]

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from prt_torch import sweep
 from prt_torch.command import main
-from prt_torch.sweep_settings import parse_sweep
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 
@@ -19,7 +18,7 @@ CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 def compare(arguments: list[str]) -> None:
     """Do the sweep of the command line, or the rest of it."""
     console = Console(width=None if sys.stdout.isatty() else 140)
-    sweep.execute(parse_sweep(arguments, CONFIGS, script="train/sweep.py"), console)
+    sweep.execute(sweep.parse_sweep(arguments, CONFIGS, script="train/sweep.py"), console)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from prt_torch.relight import Relighter
 from prt_torch.report import Picture
 from prt_torch.report.numbers import bytes_text, percent_text, seconds_text
 from prt_torch.settings import PreviewConfig
-from prt_torch.sweep_chain import Kept
+from prt_torch.sweep.chain import Kept
 from prt_torch.tradeoff import Result, at_equal, error_of
 from prt_torch.transfer import TransferTensor
 

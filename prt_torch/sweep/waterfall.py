@@ -23,11 +23,11 @@ from prt_torch import evaluate
 from prt_torch.baking import bake
 from prt_torch.bases import CubeDirections
 from prt_torch.inputs import Inputs
+from prt_torch.nesting import Parameters, Problem, closed_form
 from prt_torch.relight import Relighter
 from prt_torch.representations import Representation
 from prt_torch.settings import RunConfig
-from prt_torch.sweep_measure import viewers
-from prt_torch.sweep_nesting import Parameters, Problem, closed_form
+from prt_torch.sweep.measure import viewers
 from prt_torch.tradeoff import Stage, waterfall
 from prt_torch.transfer import TransferTensor, project
 from prt_torch.truncation import truncate

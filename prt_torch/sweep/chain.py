@@ -18,12 +18,12 @@ from prt_torch import store
 from prt_torch.errors import InputError
 from prt_torch.inputs import Inputs, load_inputs
 from prt_torch.metric import Metric
+from prt_torch.nesting import Chain, Made, Parameters, Problem, nested
 from prt_torch.representations import Representation, load, save
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.run import bake_only
 from prt_torch.settings import KINDS, RunConfig
-from prt_torch.sweep_measure import Judge
-from prt_torch.sweep_nesting import Chain, Made, Parameters, Problem, nested
+from prt_torch.sweep.measure import Judge
 from prt_torch.transfer import Surface, TransferTensor
 
 POINTS = "points"

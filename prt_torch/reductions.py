@@ -5,7 +5,7 @@ value, the largest terms of a wavelet are among its more terms, and a Tucker dec
 own principal axes can be cut in every mode. None of these goes back to the transfer for its points,
 so a reading costs a small part of a fit. What is read keeps the clusters of the larger fit, which
 were chosen for more vectors than it has: that costs error, the more the further one reads
-(docs/sweeps.md has figures), so :mod:`prt_torch.sweep_nesting` fits anew where it gets far.
+(docs/sweeps.md has figures), so :mod:`prt_torch.nesting` fits anew where it gets far.
 
 Source:
     Sloan, Hall, Hart, Snyder 2003, section 4.2 (vectors are added to clusters that stay); De

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from prt_torch.errors import InputError
-from prt_torch.sweep_settings import SlurmConfig, SweepConfig
+from prt_torch.sweep.settings import SlurmConfig, SweepConfig
 
 _POLL_SECONDS = 2.0
 

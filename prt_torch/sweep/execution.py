@@ -1,7 +1,7 @@
 """A sweep: many representations of one bake, made chain by chain, judged alike, set side by side.
 
 The folder of a sweep holds ``sweep.json`` (what was baked and lit, and from which files), a file
-and a record of every point in ``points/`` (:mod:`prt_torch.sweep_chain`), ``times.json``, and the
+and a record of every point in ``points/`` (:mod:`prt_torch.sweep.chain`), ``times.json``, and the
 report. A sweep that was killed goes on where it stopped, and one that ended takes further points:
 only what is missing is made.
 
@@ -27,18 +27,18 @@ from prt_torch.budget import Choice, Limits, Tried, refine
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
 from prt_torch.inputs import Inputs
+from prt_torch.nesting import Chain, Problem, chains
 from prt_torch.report import summary_table
 from prt_torch.report.numbers import bytes_text, error_text, percent_text, seconds_text
 from prt_torch.report.tradeoff import write_tradeoff
 from prt_torch.run import bake_only
 from prt_torch.settings import RunConfig
-from prt_torch.sweep_chain import POINTS, Kept, do, job, label, prepare, run_chain
-from prt_torch.sweep_measure import Judge
-from prt_torch.sweep_nesting import Chain, Problem, chains
-from prt_torch.sweep_pictures import pictures
-from prt_torch.sweep_settings import BudgetConfig, SweepRun
-from prt_torch.sweep_waterfall import error_stages, explained
-from prt_torch.sweep_workers import count, workers
+from prt_torch.sweep.chain import POINTS, Kept, do, job, label, prepare, run_chain
+from prt_torch.sweep.measure import Judge
+from prt_torch.sweep.pictures import pictures
+from prt_torch.sweep.settings import BudgetConfig, SweepRun
+from prt_torch.sweep.waterfall import error_stages, explained
+from prt_torch.sweep.workers import count, workers
 from prt_torch.tradeoff import COSTS, ERRORS, fronts
 from prt_torch.transfer import TransferTensor
 

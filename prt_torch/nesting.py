@@ -2,7 +2,7 @@
 
 A *chain* holds everything still but one parameter, such as CPCA's rank: its points go from the
 largest value to the smallest. The first is fitted; those not much smaller are read off it
-(:mod:`prt_torch.sweep_reductions`); the first beyond its reach is fitted anew and serves those
+(:mod:`prt_torch.reductions`); the first beyond its reach is fitted anew and serves those
 after it. Fits of falling size add up to few of the largest: a chain of 20 points costs less than
 three of them. How far a fit reaches is a compromise, of each kind, between that and what reading
 loses (docs/sweeps.md). Kinds and options that cannot be read off are fitted one by one.
@@ -20,6 +20,13 @@ from typing import Any
 import torch
 
 from prt_torch.metric import Metric
+from prt_torch.reductions import (
+    fewer_functions,
+    fewer_segment_vectors,
+    fewer_terms,
+    fewer_vectors,
+    smaller_tensor,
+)
 from prt_torch.representations import (
     CPCA,
     ClusteredTensor,
@@ -29,13 +36,6 @@ from prt_torch.representations import (
     WaveletTransfer,
 )
 from prt_torch.representations.files import KINDS
-from prt_torch.sweep_reductions import (
-    fewer_functions,
-    fewer_segment_vectors,
-    fewer_terms,
-    fewer_vectors,
-    smaller_tensor,
-)
 from prt_torch.transfer import TransferTensor
 
 Parameters = dict[str, Any]
