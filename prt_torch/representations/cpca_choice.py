@@ -167,10 +167,11 @@ class Subspaces:
         own = torch.empty_like(chunk.slots[:, 0])
         other = torch.empty_like(own)
         rival = torch.empty_like(chunk.blocks.point_of_slot)
+        nearest = chunk.blocks.by_size(nearest)
         for clusters, slots in self._runs(chunk, nearest.shape[1]):
             candidates = nearest[clusters]
             rows = chunk.slots[slots].unflatten(0, (len(candidates), -1))
-            losses = self._losses(rows, clusters, candidates)
+            losses = self._losses(rows, candidates)
             if price is not None:
                 losses += price[candidates][:, None]
             own[slots] = losses[..., 0].flatten()
@@ -179,10 +180,8 @@ class Subspaces:
             rival[slots] = candidates.gather(1, place + 1).flatten()
         return own, other, rival
 
-    def _runs(
-        self, chunk: SortedChunk, count: int
-    ) -> Iterator[tuple[slice | Int[Tensor, "some"], slice]]:
-        """Runs of clusters and their slots whose tables of products and of vectors stay small."""
+    def _runs(self, chunk: SortedChunk, count: int) -> Iterator[tuple[slice, slice]]:
+        """Runs of clusters, by falling size, and their slots whose tables stay small."""
         columns = count * (self.vectors.shape[2] + 1)
         limit = min(_CHUNK_ELEMENTS, self.points.table_elements)
         for bucket in chunk.blocks.buckets:
@@ -192,20 +191,19 @@ class Subspaces:
                 run = slice(first, first + some.stop - some.start)
                 start = bucket.first_slot + some.start * bucket.size
                 stop = bucket.first_slot + some.stop * bucket.size
-                yield chunk.blocks.numbers(run), slice(start, stop)
+                yield run, slice(start, stop)
 
     def _losses(
         self,
         rows: Float[Tensor, "clusters size d"],
-        clusters: slice | Int[Tensor, "clusters"],
         candidates: Int[Tensor, "clusters c"],
     ) -> Float[Tensor, "clusters size c"]:
-        """Squared error of each point in each candidate cluster, less its own spread.
+        """Squared error of each point in each candidate cluster, its own first, less its spread.
 
         With y the point less its own mean, δ the candidate's mean less its own, v the candidate's
         vectors: ``|y-δ|² - Σ (y·v - δ·v)² = |y|² - 2 y·δ + |δ|² - Σ (y·v - δ·v)²``.
         """
-        shift = (self.means[candidates] - self.means[clusters, None]).mT  # clusters d c
+        shift = (self.means[candidates] - self.means[candidates[:, :1]]).mT  # clusters d c
         vectors = self.vectors[candidates].permute(0, 2, 3, 1)  # clusters d rank c
         offsets = -(vectors * shift[:, :, None]).sum(1).flatten(1)
         explained = torch.baddbmm(offsets[:, None], rows, vectors.flatten(2))

@@ -23,7 +23,7 @@ from prt_torch.representations.processes import ALONE, Processes
 _LLOYD_TURNS = 100
 _ROUGH_LLOYD_TURNS = 10
 _FEW_MOVES = 5e-4  # share of points; below it the iterations end
-_BLOCK_ELEMENTS = 2**22  # of one table of distances
+_BLOCK_ELEMENTS = 2**18  # of one table of distances, so that it stays in cache
 
 
 def vector_quantise(
@@ -188,8 +188,7 @@ def _distances(
 ) -> Iterator[tuple[slice, Float[Tensor, "some seeds"]]]:
     """Squared distances to some points, by chunks."""
     for rows, values in points.chunks():
-        # A sum for each row: of products with so few columns, the last rows are rounded otherwise.
-        dots = torch.stack([(values * seed).sum(1) for seed in seeds], dim=1)
+        dots = torch.stack([steady_product(values, seed) for seed in seeds], dim=1)
         lengths = squares[rows, None] + seeds.square().sum(1)
         yield rows, lengths.sub_(dots, alpha=2.0).clamp_min_(0.0)
 
@@ -225,12 +224,12 @@ def _nearest(
     errors: Float[Tensor, "points"],
 ) -> Int[Tensor, "points"]:
     """The nearest mean of each point; writes the squared distances to ``errors``."""
-    offsets, labels = means.square().sum(1), torch.empty_like(like)
+    offsets, turned, labels = means.square().sum(1), -2.0 * means.mT, torch.empty_like(like)
     step = max(1, min(_BLOCK_ELEMENTS, points.table_elements) // len(means))
     for rows, values in points.chunks():
         for some in slices(len(values), step):
             own = values[some]
-            table = steady_product(own, means.mT).mul_(-2.0).add_(offsets)
+            table = steady_product(own, turned).add_(offsets)
             distance, label = table.min(dim=1)
             to = slice(rows.start + some.start, rows.start + some.stop)
             labels[to] = label.to(labels.dtype)

@@ -25,6 +25,7 @@ from prt_torch.representations.processes import Processes
 
 _EXACT = 53  # bits of whole numbers in float64
 _LEAST_EXPONENT = -100  # of the largest: a unit of less has no inverse in float32
+_ROWS = 512  # that are converted together, so that they stay in cache
 _LIMBS = {torch.float64: 3}  # that hold all digits; of other types, one
 
 
@@ -54,11 +55,9 @@ class FixedPoint:
         return torch.ldexp(torch.ones_like(exponents, dtype=torch.float64), exponents)
 
     @staticmethod
-    def units(values: Float[Tensor, "*some"], step: Float[Tensor, "*some"]) -> Tensor:
-        """Whole numbers of steps, float64."""
-        if values.dtype == torch.float64:
-            return values.div(step).round_()
-        return values.float().mul((1.0 / step).float()).round_().double()
+    def units(values: Float[Tensor, "*some"], per_step: Float[Tensor, "*some"]) -> Tensor:
+        """Whole numbers of steps, float64; ``per_step`` are the inverses, in the type of values."""
+        return values.mul(per_step).round_().double()
 
 
 class ExactProducts:
@@ -82,18 +81,20 @@ class ExactProducts:
 
     def _limbs(self, values: Tensor, step: Tensor) -> list[Float[Tensor, "some columns"]]:
         """Whole numbers, each a unit of the one before cut in ``2^bits``."""
-        limbs = [self._fixed.units(values, step)]
+        limbs = [self._fixed.units(values, (1.0 / step).to(values))]
         for _ in self._sums[1:]:
             values = values - limbs[-1] * step
             step = step / 2**self._fixed.bits
-            limbs.append(self._fixed.units(values, step))
+            limbs.append(self._fixed.units(values, 1.0 / step))
         return limbs
 
     def add(self, left: Float[Tensor, "some a"], right: Float[Tensor, "some b"]) -> None:
         """Some points' values."""
-        pairs = zip(left.split(self._fixed.rows), right.split(self._fixed.rows), strict=True)
+        most = min(_ROWS, self._fixed.rows)
+        pairs = zip(left.split(most), right.split(most), strict=True)
         for some, others in pairs:
-            first, second = self._limbs(some, self._left), self._limbs(others, self._right)
+            first = self._limbs(some, self._left)
+            second = first if left is right else self._limbs(others, self._right)
             for place, total in enumerate(self._sums):
                 for limb in range(place + 1):
                     total += (first[limb].mT @ second[place - limb]).long()
@@ -125,8 +126,8 @@ class ExactClusterProducts:
     def look(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots columns"]) -> None:
         """Some points' values of both kinds, to find the largest of each cluster and column."""
         for largest, own in zip((self._left, self._right), values, strict=True):
-            for some, rows in blocks.of_buckets(own):
-                largest[some] = torch.maximum(largest[some], rows.abs().amax(1))
+            found = torch.cat([rows.abs().amax(1) for _, (rows,) in blocks.runs(own)])
+            torch.maximum(largest, blocks.by_number(found), out=largest)
 
     def looked(self) -> None:
         """All have been seen."""
@@ -136,14 +137,25 @@ class ExactClusterProducts:
 
     def add(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots columns"]) -> None:
         """The same values again, to be added."""
-        for (some, first), (_, second) in zip(*map(blocks.of_buckets, values), strict=True):
-            for start in range(0, first.shape[1], self._fixed.rows):
-                run = slice(start, start + self._fixed.rows)
-                one = self._fixed.units(first[:, run], self._left[some, None])
-                other = self._fixed.units(second[:, run], self._right[some, None])
-                self._sum[some] += torch.bmm(one.mT, other).long()
+        steps = (self._left, self._right)
+        left, right = (blocks.by_size(1.0 / step)[:, None].to(values[0]) for step in steps)
+        found, most = [], self._fixed.rows
+        for some, (first, second) in blocks.runs(*values):
+            one = self._fixed.units(first, left[some]).split(most, dim=1)
+            other = self._fixed.units(second, right[some]).split(most, dim=1)
+            found.append(sum(_product(a, b).long() for a, b in zip(one, other, strict=True)))
+        self._sum += blocks.by_number(torch.cat(found))
 
     def value(self) -> Float[Tensor, "clusters left right"]:
         """The sum over all processes, float64."""
         total = self._processes.sum(self._sum).double()
         return total * self._left[:, :, None] * self._right[:, None]
+
+
+def _product(
+    left: Float[Tensor, "clusters size a"], right: Float[Tensor, "clusters size b"]
+) -> Float[Tensor, "clusters a b"]:
+    """``left^T right``; with the wider one last it takes less than half the time."""
+    if left.shape[2] <= right.shape[2]:
+        return torch.bmm(left.mT, right)
+    return torch.bmm(right.mT, left).mT

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 _BUCKET_COST = 1500  # slots of padding that are worth one batched product less
+_RUN_ELEMENTS = 2**18
 _CUTS = 48  # places considered for the border between two buckets
 
 
@@ -72,9 +73,7 @@ class ClusterBlocks(nn.Module):
     cluster_of_slot: Tensor
     filled: Tensor
 
-    def __init__(
-        self, labels: Int[Tensor, "points"], num_clusters: int, *, slots_by: int = 1
-    ):
+    def __init__(self, labels: Int[Tensor, "points"], num_clusters: int, *, slots_by: int = 1):
         super().__init__()
         sizes = torch.bincount(labels, minlength=num_clusters)
         if len(sizes) != num_clusters:
@@ -131,25 +130,38 @@ class ClusterBlocks(nn.Module):
             values[b.slots].reshape(b.num_clusters, b.size * per_slot, width) for b in self.buckets
         ]
 
-    def of_buckets(
-        self, values: Float[Tensor, "slots *rest"]
-    ) -> Iterator[tuple[slice | Int[Tensor, "some"], Float[Tensor, "some size *rest"]]]:
-        """Numbers of each bucket's clusters with a view of their slots."""
+    def runs(
+        self, *values: Shaped[Tensor, "slots *rest"], most: int = _RUN_ELEMENTS
+    ) -> Iterator[tuple[slice, list[Tensor]]]:
+        """A few clusters at a time, with views ``"some size *rest"`` of their slots.
+
+        What is made of them is small enough to stay in cache. Clusters are counted from the largest
+        to the smallest: :meth:`by_size` and :meth:`by_number` say which these are.
+
+        Args:
+            values: Of the slots.
+            most: Elements of a view, if more than one cluster is in it.
+        """
+        width = max(1, *(math.prod(one.shape[1:]) for one in values))
         for bucket in self.buckets:
-            own = values[bucket.slots].unflatten(0, (bucket.num_clusters, bucket.size))
-            yield self.numbers(bucket.clusters), own
+            views = [
+                one[bucket.slots].unflatten(0, (bucket.num_clusters, bucket.size)) for one in values
+            ]
+            count = max(1, most // (bucket.size * width))
+            for first in range(0, bucket.num_clusters, count):
+                last = min(first + count, bucket.num_clusters)
+                some = slice(bucket.first_cluster + first, bucket.first_cluster + last)
+                yield some, [view[first:last] for view in views]
 
-    def numbers(self, clusters: slice) -> slice | Int[Tensor, "some"]:
-        """Of clusters counted from the largest to the smallest."""
-        return clusters if self._by_size is None else self._by_size[clusters]
+    def by_size(self, values: Shaped[Tensor, "clusters *rest"]) -> Tensor:
+        """Values of the clusters from the largest to the smallest."""
+        return values if self._by_size is None else values[self._by_size]
 
-    def _in_order(self, matrices: Float[Tensor, "clusters *rest"]) -> Tensor:
-        return matrices if self._by_size is None else matrices[self._by_size]
-
-    def _by_number(self, results: Float[Tensor, "clusters *rest"]) -> Tensor:
+    def by_number(self, values: Shaped[Tensor, "clusters *rest"]) -> Tensor:
+        """The inverse of :meth:`by_size`."""
         if self._by_size is None:
-            return results
-        return torch.empty_like(results).index_copy_(0, self._by_size, results)
+            return values
+        return torch.empty_like(values).index_copy_(0, self._by_size, values)
 
     def matmul(
         self,
@@ -158,8 +170,8 @@ class ClusterBlocks(nn.Module):
         offsets: Float[Tensor, "clusters b"] | None = None,
     ) -> Float[Tensor, "slots *rest b"]:
         """Each slot's rows times its own cluster's matrix, plus its cluster's offset."""
-        matrices = self._in_order(matrices)
-        offsets = None if offsets is None else self._in_order(offsets)
+        matrices = self.by_size(matrices)
+        offsets = None if offsets is None else self.by_size(offsets)
         products = [
             torch.bmm(rows, matrices[bucket.clusters])
             if offsets is None
@@ -175,12 +187,12 @@ class ClusterBlocks(nn.Module):
     ) -> Float[Tensor, "clusters a b"]:
         """Sum over each cluster's slots of the outer products of its rows."""
         pairs = zip(self.by_bucket(left), self.by_bucket(right), strict=True)
-        return self._by_number(torch.cat([torch.bmm(a.mT, b) for a, b in pairs]))
+        return self.by_number(torch.cat([torch.bmm(a.mT, b) for a, b in pairs]))
 
     def sum(self, slots: Float[Tensor, "slots a"]) -> Float[Tensor, "clusters a"]:
         """Sum over each cluster's slots, in float64."""
-        sums = [rows.double().sum(1) for rows in self.by_bucket(slots)]  # 3x faster than dtype=
-        return self._by_number(torch.cat(sums))
+        sums = [rows.double().sum(1) for _, (rows,) in self.runs(slots)]  # 3x faster than dtype=
+        return self.by_number(torch.cat(sums))
 
     def sizes(self) -> Int[Tensor, "clusters"]:
         """Points a cluster."""
@@ -191,14 +203,14 @@ def _buckets(sizes: list[int], slots_by: int) -> list[Bucket]:
     """Cut clusters, sorted by falling size, into buckets of least padding plus bucket cost."""
     sizes = [max(1, -(-size // slots_by)) * slots_by for size in sizes]
     count = len(sizes)
-    cuts = sorted({round(i * count / min(count, _CUTS)) for i in range(min(count, _CUTS) + 1)})
+    steps = [place for place in range(1, count) if sizes[place] < sizes[place - 1]]
+    some = min(len(steps), _CUTS)
+    cuts = [0, *(steps[place * len(steps) // some] for place in range(some)), count]
     best: list[tuple[int, int]] = [(0, 0)]  # cost of the clusters before a cut, cut before it
     for end in range(1, len(cuts)):
         options = [
             (
-                best[start][0]
-                + sizes[cuts[start]] * (cuts[end] - cuts[start])
-                + _BUCKET_COST,
+                best[start][0] + sizes[cuts[start]] * (cuts[end] - cuts[start]) + _BUCKET_COST,
                 start,
             )
             for start in range(end)

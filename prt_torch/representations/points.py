@@ -68,7 +68,9 @@ class Memory:
     @property
     def block_bytes(self) -> int:
         """Bytes of values that are read together; reading takes them three times over."""
-        return _BLOCK_BYTES if self.budget is None else min(_BLOCK_BYTES, self._free // _BLOCK_SHARE)
+        return (
+            _BLOCK_BYTES if self.budget is None else min(_BLOCK_BYTES, self._free // _BLOCK_SHARE)
+        )
 
     @property
     def table_bytes(self) -> int | None:
@@ -222,8 +224,17 @@ class SortedChunk:
     def matmul(
         self, values: Float[Tensor, "slots *rows a"], matrices: Float[Tensor, "clusters a b"]
     ) -> Float[Tensor, "slots *rows b"]:
-        """Each slot's rows times its own cluster's matrix (:func:`steady_product`)."""
-        return self.blocks.matmul(values, _filled_up(matrices))[..., : matrices.shape[-1]]
+        """Each slot's rows times its own cluster's matrix, steady (:func:`steady_product`).
+
+        Both are multiplied transposed, which for few columns is up to five times faster.
+        """
+        turned = self.blocks.by_size(_filled_up(matrices)).mT
+        pairs = zip(self.blocks.buckets, self.blocks.by_bucket(values), strict=True)
+        products = [
+            torch.bmm(turned[own.clusters], rows.mT).mT.flatten(0, 1) for own, rows in pairs
+        ]
+        joined = torch.cat(products) if len(products) > 1 else products[0]
+        return joined.view(*values.shape[:-1], -1)[..., : matrices.shape[-1]]
 
 
 class SortedPoints:
@@ -273,8 +284,9 @@ class SortedPoints:
         return SortedChunk(place, blocks, slots)
 
     def _subtract(self, blocks: ClusterBlocks, slots: Tensor) -> None:
-        for clusters, own in blocks.of_buckets(slots):
-            own -= self._means[clusters, None]
+        means = blocks.by_size(self._means)[:, None]
+        for clusters, (own,) in blocks.runs(slots):
+            own -= means[clusters]
         slots.index_fill_(0, blocks.padding, 0.0)
 
     def sum(self, of_chunk: Callable[[SortedChunk], Tensor], *shape: int) -> Tensor:
@@ -306,12 +318,13 @@ class SortedPoints:
         if self.points.like.dtype == torch.float64:
             total = self.points.like.new_zeros(self.num_clusters, left, right)
             for blocks, first, second in results():
-                pairs = zip(blocks.of_buckets(first), blocks.of_buckets(second), strict=True)
-                for (some, one), (_, other) in pairs:
-                    total[some] += torch.bmm(one.mT, other)
+                total += blocks.transposed_matmul(first, second)
             return self.points.processes.sum(total)
         sums = ExactClusterProducts(
-            (self.num_clusters, left, right), self.points.like, self.points.total, self.points.processes
+            (self.num_clusters, left, right),
+            self.points.like,
+            self.points.total,
+            self.points.processes,
         )
         for blocks, first, second in results():
             sums.look(blocks, first, second)
@@ -322,20 +335,24 @@ class SortedPoints:
 
 
 def steady_product(
-    rows: Float[Tensor, "rows a"], matrix: Float[Tensor, "a b"]
-) -> Float[Tensor, "rows b"]:
+    rows: Float[Tensor, "rows a"], factor: Float[Tensor, "a *b"]
+) -> Float[Tensor, "rows *b"]:
     """A product in which what a row gets does not depend on its place or on how many there are.
 
     So points fall into the same clusters whatever the chunk, or the process, that they are in.
+
+    Args:
+        rows: Of points.
+        factor: A matrix or a vector.
     """
-    matrix, columns = _filled_up(matrix), matrix.shape[1]
+    filled = _filled_up(factor) if factor.ndim == 2 else factor
     beyond = len(rows) % _STEADY_ROWS
     whole = len(rows) - beyond
-    out = rows.new_empty(len(rows), matrix.shape[1])
-    torch.mm(rows[:whole], matrix, out=out[:whole])
+    out = rows.new_empty(len(rows), *filled.shape[1:])
+    torch.matmul(rows[:whole], filled, out=out[:whole])
     if beyond:
-        out[whole:] = (pad(rows[whole:], (0, 0, 0, _STEADY_ROWS - beyond)) @ matrix)[:beyond]
-    return out[:, :columns]
+        out[whole:] = (pad(rows[whole:], (0, 0, 0, _STEADY_ROWS - beyond)) @ filled)[:beyond]
+    return out if factor.ndim == 1 else out[:, : factor.shape[1]]
 
 
 def _filled_up(matrices: Float[Tensor, "*some a b"]) -> Float[Tensor, "*some a b_or_more"]:
