@@ -51,15 +51,10 @@ from prt_torch.representations.clustered_tensor_search import (
     find_clusters,
     first_clusters,
 )
-from prt_torch.representations.points import (
-    Mapped,
-    Memory,
-    Points,
-    SortedPoints,
-    label_type,
-    slices,
-)
+from prt_torch.representations.magnitude import of_ordinary_magnitude
+from prt_torch.representations.points import Mapped, Points, SortedPoints, label_type, slices
 from prt_torch.representations.processes import ALONE, Processes
+from prt_torch.representations.scratch import Memory
 from prt_torch.transfer import TransferTensor
 
 _FIRST_LOSS = 1e-4  # of the energy, that each mode may lose to the projection at first
@@ -104,19 +99,22 @@ class TensorStatistics:
 
     @classmethod
     def together(
-        cls, groups: Sequence["TensorStatistics"], seconds: dict[str, float]
+        cls, groups: Sequence["TensorStatistics"], seconds: dict[str, float], power: float
     ) -> "TensorStatistics":
-        """Of all groups; ``seconds`` are those of the whole."""
+        """Of all groups; ``seconds`` are those of the whole, errors in ``power`` times its unit."""
         norm = sum(one.squared_norm for one in groups)
         lost = sum(one.projection_lost * one.squared_norm for one in groups)
         turns = range(max(len(one.errors) for one in groups))
         moved = itertools.zip_longest(*(one.moved for one in groups), fillvalue=0)
         return cls(
-            squared_norm=norm,
-            squared_error=sum(one.squared_error for one in groups),
+            squared_norm=norm / power / power,
+            squared_error=sum(one.squared_error for one in groups) / power / power,
             projection_lost=lost / (norm or 1.0),
             axes=(max(one.axes[0] for one in groups), max(one.axes[1] for one in groups)),
-            errors=[sum(one.errors[min(t, len(one.errors) - 1)] for one in groups) for t in turns],
+            errors=[
+                sum(one.errors[min(t, len(one.errors) - 1)] for one in groups) / power / power
+                for t in turns
+            ],
             moved=[sum(counts) for counts in moved],
             seconds=seconds,
         )
@@ -196,6 +194,8 @@ def encode(
         InputError: If the memory budget is too small, or there are fewer clusters than materials.
     """
     clock, processes = _Clock(), options.processes
+    memory = Memory(options.memory_budget)
+    transfer, power = of_ordinary_magnitude(transfer, memory, processes)
     groups = split(transfer, processes)
     rows, coeffs = transfer.num_channels * transfer.num_rows, transfer.num_coeffs
     moments = [
@@ -203,7 +203,7 @@ def encode(
             part,
             options.metric,
             least_light=min(ranks[1], coeffs),
-            memory=Memory(options.memory_budget),
+            memory=memory,
             processes=processes,
             generator=options.generator,
         )
@@ -221,8 +221,9 @@ def encode(
         found.append((points, encoding))
         statistics.append(facts)
     joined = join(found, processes)
+    joined.parameters.weights.div_(power)
     clock.tick("weights")
-    return joined, TensorStatistics.together(statistics, clock.seconds)
+    return joined, TensorStatistics.together(statistics, clock.seconds, power)
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,8 @@ from torch import Tensor
 
 from prt_torch.representations.cpca_subspaces import condensed, one_thread, principal
 from prt_torch.representations.orthonormal import orthonormal
-from prt_torch.representations.points import (
-    Points,
-    SortedChunk,
-    SortedPoints,
-    cluster_sizes,
-    laid_out,
-    steady_product,
-)
+from prt_torch.representations.points import Points, SortedChunk, SortedPoints, cluster_sizes
+from prt_torch.representations.steady import laid_out, steady_product
 from prt_torch.representations.whitening import whitening
 
 _STIFF = {torch.float64: 1e3, torch.float32: 1e5}  # as in cpca_subspaces

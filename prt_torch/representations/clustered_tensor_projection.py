@@ -24,9 +24,10 @@ from prt_torch.metric import Metric
 from prt_torch.representations.cpca_projection import directions
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.exact_sums import ExactProducts
-from prt_torch.representations.points import Memory, Points, laid_out, steady_product
+from prt_torch.representations.points import Points
 from prt_torch.representations.processes import ALONE, Processes
-from prt_torch.representations.scratch import ScratchRows
+from prt_torch.representations.scratch import Memory, ScratchRows
+from prt_torch.representations.steady import laid_out, steady_product
 from prt_torch.transfer import TransferTensor
 
 _COPIES = 3  # of points that must fit in memory: themselves, in fewer rows, and sorted by cluster

@@ -22,7 +22,8 @@ from torch import Tensor
 from prt_torch.representations.cpca_choice import Subspaces
 from prt_torch.representations.cpca_iteration import NEAREST, PrincipalAxes
 from prt_torch.representations.cpca_subspaces import Decomposition, decompose
-from prt_torch.representations.points import Points, laid_out, renumber
+from prt_torch.representations.points import Points, renumber
+from prt_torch.representations.steady import laid_out
 
 _LARGEST_RANK = 3  # times the mean rank
 _TURNS = 16

@@ -23,9 +23,9 @@ from prt_torch.representations.points import (
     SortedChunk,
     SortedPoints,
     cluster_sizes,
-    laid_out,
     slices,
 )
+from prt_torch.representations.steady import laid_out
 
 _CHUNK_ELEMENTS = 2**21  # of one table of products; larger ones cost more for their memory
 

@@ -1,6 +1,7 @@
 """How CPCA finds its clusters and subspaces.
 
-1. Transfer is weighed by the metric, so that errors are plain sums of squares. Where a point has
+1. Transfer of extreme magnitude is scaled (``magnitude``), and weighed by the metric, so that
+   errors are plain sums of squares. Where a point has
    more values than ``MAX_DIMENSIONS``, one near-lossless projection (``cpca_projection``) makes
    every later step cheap.
 2. Lloyd's iterations give the first clusters (``cpca_clusters``): from k-means++ seeds and to their
@@ -33,9 +34,9 @@ from prt_torch.representations.cpca_clusters import vector_quantise
 from prt_torch.representations.cpca_iteration import iterate
 from prt_torch.representations.cpca_projection import Projected, project, weighed_blocks
 from prt_torch.representations.cpca_subspaces import Decomposition, decompose
+from prt_torch.representations.magnitude import of_ordinary_magnitude
 from prt_torch.representations.points import (
     Mapped,
-    Memory,
     Points,
     SortedPoints,
     cluster_sizes,
@@ -43,6 +44,7 @@ from prt_torch.representations.points import (
     slices,
 )
 from prt_torch.representations.processes import ALONE, Processes
+from prt_torch.representations.scratch import Memory
 from prt_torch.transfer import TransferTensor
 
 Method = Literal["iterative", "static", "adaptive"]
@@ -96,6 +98,7 @@ def encode(
     rank = min(rank, size)
     dimensions = max(MAX_DIMENSIONS, 3 * rank)
     memory = _memory(transfer, num_clusters, rank, min(size, dimensions), memory_budget)
+    transfer, power = of_ordinary_magnitude(transfer, memory, processes)
     projected = project(transfer, metric, dimensions, generator, memory, processes)
     points = projected.points
     data_mean = _centre(points) if affine else points.like.new_zeros(points.rest)
@@ -109,11 +112,14 @@ def encode(
         found = decompose(points, labels, num_clusters, rank, affine)
         ranks = torch.full_like(found.sizes, rank)
     del labels
+    representatives = _representatives(
+        transfer, metric, projected, found, ranks, data_mean if affine else None
+    )
+    if affine:
+        representatives[(ranks + 1).cumsum(0) - ranks - 1] /= power
     return Encoding(
-        representatives=_representatives(
-            transfer, metric, projected, found, ranks, data_mean if affine else None
-        ),
-        weights=_weights(points, found, ranks),
+        representatives=representatives,
+        weights=_weights(points, found, ranks).div_(power),
         labels=found.labels.long(),
         ranks=ranks,
         affine=affine,

@@ -26,7 +26,8 @@ from prt_torch.representations.cpca_clusters import count_moves
 from prt_torch.representations.cpca_relocation import relocate
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.exact_sums import ExactProducts
-from prt_torch.representations.points import Points, renumber, steady_product, total_of
+from prt_torch.representations.points import Points, renumber, total_of
+from prt_torch.representations.steady import steady_product
 
 NEAREST = 16
 """Clusters a point may move to in one turn."""

@@ -1,5 +1,4 @@
-"""Points that algorithms pass over: in memory at once or in chunks from a file, here or on several
-processes.
+"""Points that algorithms pass over: at once or in chunks from a file, here or on several processes.
 
 An algorithm reads chunk after chunk, keeps what belongs to a point in plain tensors, and adds up
 what belongs to a cluster in float64. With enough memory there is one chunk, and this is plain code
@@ -14,90 +13,18 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 
-from prt_torch.errors import InputError
 from prt_torch.representations.exact_sums import ExactClusterProducts
 from prt_torch.representations.grouped import ClusterBlocks
 from prt_torch.representations.processes import ALONE, Processes
-from prt_torch.representations.scratch import ScratchRows
+from prt_torch.representations.scratch import Memory, ScratchRows
+from prt_torch.representations.steady import STEADY_ROWS, filled_up
 from prt_torch.transfer import Rows
 
 SLICE = 2**16
 """Points whose numbers are looked at together where their values are not read."""
 
-# Shares of the memory that is free. Together they leave a third of it: what is freed between other
-# things is not given back to the system.
-_CHUNK_SHARE = 40  # 16 copies of a chunk may be alive at once
-_BLOCK_SHARE = 16  # reading takes a block three times over
-_TABLE_SHARE = 8
-_RESIDENT_SHARE = 8  # of one set of values of all points, which is kept in a file if it is larger
-
-_BLOCK_BYTES = 2**26  # of values that are read together at most
-_LEAST_CHUNK = 2**15  # bytes; smaller ones would take hours
-_OWN = 4 * 2**20  # bytes that libraries take for themselves
-# Matrix products round what is beyond multiples of these in another way (found with MKL).
-_STEADY_ROWS = 16
-_STEADY_COLUMNS = 4
 _FEW_COLUMNS = 8
-
-
-@dataclass(frozen=True)
-class Memory:
-    """What a fit may take at its peak, beside what was there before.
-
-    Attributes:
-        budget: Bytes; None for as much as there is.
-        reserved: Bytes of it that are spoken for: labels, weights, sums.
-    """
-
-    budget: int | None = None
-    reserved: int = 0
-
-    def __post_init__(self) -> None:
-        least = self.reserved + _OWN + _CHUNK_SHARE * _LEAST_CHUNK
-        if self.budget is not None and self.budget < least:
-            raise InputError(
-                f"memory_budget: this fit needs at least {least} bytes, got {self.budget}"
-            )
-
-    @property
-    def chunk_bytes(self) -> int | None:
-        """Bytes of points that are worked on together; None for all of them."""
-        return None if self.budget is None else self._free // _CHUNK_SHARE
-
-    @property
-    def block_bytes(self) -> int:
-        """Bytes of values that are read together; reading takes them three times over."""
-        return (
-            _BLOCK_BYTES if self.budget is None else min(_BLOCK_BYTES, self._free // _BLOCK_SHARE)
-        )
-
-    @property
-    def table_bytes(self) -> int | None:
-        """Bytes that one large table may take."""
-        return None if self.budget is None else self._free // _TABLE_SHARE
-
-    @property
-    def _free(self) -> int:
-        return (self.budget or 0) - self.reserved - _OWN
-
-    def fits(self, nbytes: int) -> bool:
-        """Whether something of this size may be in memory for a while."""
-        return self.budget is None or nbytes <= self._free // 2
-
-    def rows_at_once(self, row_bytes: int) -> int | None:
-        """Rows of a chunk."""
-        if self.chunk_bytes is None:
-            return None
-        return max(1, self.chunk_bytes // row_bytes // _STEADY_ROWS) * _STEADY_ROWS
-
-    def empty(self, shape: tuple[int, ...], like: Tensor) -> "Tensor | ScratchRows":
-        """Room for rows, in memory if they are a small part of what is free."""
-        nbytes = math.prod(shape) * like.element_size()
-        if self.budget is None or nbytes <= self._free // _RESIDENT_SHARE:
-            return like.new_empty(shape)
-        return ScratchRows(shape, like)
 
 
 class Points:
@@ -229,12 +156,14 @@ class SortedChunk:
 
         A few columns are multiplied transposed, which is up to five times faster.
         """
-        filled, columns = _filled_up(matrices), matrices.shape[-1]
+        filled, columns = filled_up(matrices), matrices.shape[-1]
         if filled.shape[-1] > _FEW_COLUMNS:
             return self.blocks.matmul(values, filled)[..., :columns]
         turned = self.blocks.by_size(filled).mT
         pairs = zip(self.blocks.buckets, self.blocks.by_bucket(values), strict=True)
-        products = [torch.bmm(turned[own.clusters], rows.mT).mT.flatten(0, 1) for own, rows in pairs]
+        products = [
+            torch.bmm(turned[own.clusters], rows.mT).mT.flatten(0, 1) for own, rows in pairs
+        ]
         joined = torch.cat(products) if len(products) > 1 else products[0]
         return joined.view(*values.shape[:-1], -1)[..., :columns]
 
@@ -277,7 +206,7 @@ class SortedPoints:
         if bool((labels < 0).any()):
             taken = torch.nonzero(labels >= 0)[:, 0]
             labels, values, place = labels[taken], values[taken], rows.start + taken
-        blocks = ClusterBlocks(labels, self.num_clusters, slots_by=_STEADY_ROWS)
+        blocks = ClusterBlocks(labels, self.num_clusters, slots_by=STEADY_ROWS)
         slots = values.index_select(0, blocks.point_of_slot)
         if self._means is not None:
             self._subtract(blocks, slots)
@@ -334,46 +263,6 @@ class SortedPoints:
         for blocks, first, second in results():
             sums.add(blocks, first, second)
         return sums.value()
-
-
-def steady_product(
-    rows: Float[Tensor, "rows a"], factor: Float[Tensor, "a *b"]
-) -> Float[Tensor, "rows *b"]:
-    """A product in which what a row gets does not depend on its place or on how many there are.
-
-    So points fall into the same clusters whatever the chunk, or the process, that they are in.
-
-    Args:
-        rows: Of points.
-        factor: A matrix or a vector.
-    """
-    filled = _filled_up(factor) if factor.ndim == 2 else factor
-    beyond = len(rows) % _STEADY_ROWS
-    whole = len(rows) - beyond
-    out = rows.new_empty(len(rows), *filled.shape[1:])
-    torch.matmul(rows[:whole], filled, out=out[:whole])
-    if beyond:
-        out[whole:] = (pad(rows[whole:], (0, 0, 0, _STEADY_ROWS - beyond)) @ filled)[:beyond]
-    return out if factor.ndim == 1 else out[:, : factor.shape[1]]
-
-
-def _filled_up(matrices: Float[Tensor, "*some a b"]) -> Float[Tensor, "*some a b_or_more"]:
-    """Row after row, with columns of zeros up to a number that products are steady with.
-
-    Products with another layout of the same matrix are rounded in another way, and so are those
-    with a number of columns that leaves some over.
-    """
-    beyond = -matrices.shape[-1] % _STEADY_COLUMNS
-    if beyond:
-        return pad(matrices, (0, beyond))
-    # ``contiguous`` would leave the strides of dimensions of size 1 as they are, which count too.
-    plain = matrices.stride() == torch.empty(matrices.shape, device="meta").stride()
-    return matrices if plain else laid_out(matrices)
-
-
-def laid_out(matrices: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """A copy, row after row."""
-    return matrices.clone(memory_format=torch.contiguous_format)
 
 
 def label_type(num_clusters: int) -> torch.dtype:

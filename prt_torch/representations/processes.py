@@ -1,9 +1,9 @@
 """The processes of one fit, each with points of its own; usually there is just one.
 
-Fits look at points in two ways only: they change what belongs to a point (its cluster, its weights),
-which needs no other process, and they add up over points (means, moments, errors), which is one
-reduction. So a fit on several processes is the fit on one with :meth:`Processes.sum` where sums
-are. Sums are those of float64 and all else follows from them, so every process makes the same
+Fits look at points in two ways only: they change what belongs to a point (its cluster, its
+weights), which needs no other process, and they add up over points (means, moments, errors), which
+is one reduction. So a fit on several processes is the fit on one with :meth:`Processes.sum` where
+sums are. Sums are those of float64 and all else follows from them, so every process makes the same
 clusters and vectors, and those of a single process but for the order of the additions.
 
 What one process alone may decide (which of its points has the largest error, where a random draw

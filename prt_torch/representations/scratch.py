@@ -1,4 +1,4 @@
-"""Rows that do not fit in memory, kept in a temporary file for as long as they are needed.
+"""A budget of memory, and rows that do not fit in it, kept in a temporary file.
 
 The file has no name, so nothing is left of it whatever happens to the process. It lies where
 Python's ``tempfile`` puts files (``TMPDIR``), which should be a disk, not memory.
@@ -7,12 +7,25 @@ Python's ``tempfile`` puts files (``TMPDIR``), which should be a disk, not memor
 import math
 import os
 import tempfile
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
 from prt_torch.errors import InputError
+from prt_torch.representations.steady import STEADY_ROWS
+
+# Shares of the memory that is free. Together they leave a third of it: what is freed between other
+# things is not given back to the system.
+_CHUNK_SHARE = 40  # 16 copies of a chunk may be alive at once
+_BLOCK_SHARE = 16  # reading takes a block three times over
+_TABLE_SHARE = 8
+_RESIDENT_SHARE = 8  # of one set of values of all points, which is kept in a file if it is larger
+
+_BLOCK_BYTES = 2**26  # of values that are read together at most
+_LEAST_CHUNK = 2**15  # bytes; smaller ones would take hours
+_OWN = 4 * 2**20  # bytes that libraries take for themselves
 
 
 class ScratchRows:
@@ -30,7 +43,8 @@ class ScratchRows:
         self.shape, self.dtype, self._device = shape, like.dtype, like.device
         self._row_bytes = math.prod(shape[1:]) * like.element_size()
         try:
-            self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115: lives as long as self
+            # It lives as long as this object.
+            self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
             os.truncate(self._file.fileno(), shape[0] * self._row_bytes)
         except OSError as error:
             raise self._no_room(error) from error
@@ -69,6 +83,64 @@ class ScratchRows:
             f"{self.shape[0] * self._row_bytes} bytes is needed beside memory ({error.strerror}); "
             "set TMPDIR to a folder with room"
         )
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a fit may take at its peak, beside what was there before.
+
+    Attributes:
+        budget: Bytes; None for as much as there is.
+        reserved: Bytes of it that are spoken for: labels, weights, sums.
+    """
+
+    budget: int | None = None
+    reserved: int = 0
+
+    def __post_init__(self) -> None:
+        least = self.reserved + _OWN + _CHUNK_SHARE * _LEAST_CHUNK
+        if self.budget is not None and self.budget < least:
+            raise InputError(
+                f"memory_budget: this fit needs at least {least} bytes, got {self.budget}"
+            )
+
+    @property
+    def chunk_bytes(self) -> int | None:
+        """Bytes of points that are worked on together; None for all of them."""
+        return None if self.budget is None else self._free // _CHUNK_SHARE
+
+    @property
+    def block_bytes(self) -> int:
+        """Bytes of values that are read together; reading takes them three times over."""
+        return (
+            _BLOCK_BYTES if self.budget is None else min(_BLOCK_BYTES, self._free // _BLOCK_SHARE)
+        )
+
+    @property
+    def table_bytes(self) -> int | None:
+        """Bytes that one large table may take."""
+        return None if self.budget is None else self._free // _TABLE_SHARE
+
+    @property
+    def _free(self) -> int:
+        return (self.budget or 0) - self.reserved - _OWN
+
+    def fits(self, nbytes: int) -> bool:
+        """Whether something of this size may be in memory for a while."""
+        return self.budget is None or nbytes <= self._free // 2
+
+    def rows_at_once(self, row_bytes: int) -> int | None:
+        """Rows of a chunk."""
+        if self.chunk_bytes is None:
+            return None
+        return max(1, self.chunk_bytes // row_bytes // STEADY_ROWS) * STEADY_ROWS
+
+    def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor | ScratchRows:
+        """Room for rows, in memory if they are a small part of what is free."""
+        nbytes = math.prod(shape) * like.element_size()
+        if self.budget is None or nbytes <= self._free // _RESIDENT_SHARE:
+            return like.new_empty(shape)
+        return ScratchRows(shape, like)
 
 
 def _bytes_of(values: Tensor) -> memoryview:

@@ -13,9 +13,9 @@ from prt_torch.representations.cpca_subspaces import one_thread
 
 
 def whitening(gram: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
-    """A matrix T for which ``T^T G T`` is the identity; zero columns, in front, where G has no more.
+    """A matrix T for which ``T^T G T`` is the identity.
 
-    So ``columns @ T`` are orthonormal, the strongest last.
+    So ``columns @ T`` are orthonormal, the strongest last; in front are zeros where G has no more.
 
     Args:
         gram: Products of the columns with each other, float64.
