@@ -212,7 +212,7 @@ class TestExtremes:
             least=(1, 1),
             memory_budget=2**30,
         )
-        kept = float(found.points.square().sum()) / moments.squared_norm
+        kept = found.points.squared_norm() / moments.squared_norm
         assert 0.9 < kept < 1.0
         assert 1 - kept <= found.lost * (1 + 1e-9)
 

@@ -240,7 +240,8 @@ class _Group:
     def encode(self) -> tuple[Encoding, TensorStatistics]:
         """All phases."""
         trace, rank, options, norm = Trace(), self.rank, self.options, self.moments.squared_norm
-        found, points, labels, bases = self._start()
+        found, labels, bases = self._start()
+        points = found.points
         first_views = points.stored(lambda values: values[:, : rank.view], *self._seen(points))
         labels, bases = find_clusters(
             first_views,
@@ -281,11 +282,12 @@ class _Group:
         shape = self._seen(points)
         return points.with_rows(Mapped(points.rows, lambda values: in_view(values, view), *shape))
 
-    def _start(self) -> tuple[Projection, Points, Int[Tensor, "points"], Bases]:
+    def _start(self) -> tuple[Projection, Int[Tensor, "points"], Bases]:
         """Enough axes, first clusters, and where their bases begin."""
         rank, norm, generator = self.rank, self.moments.squared_norm, self.options.generator
         allowed = _FIRST_LOSS * norm
-        found, points = self._projected(allowed)
+        found = self._projected(allowed)
+        points = found.points
         self.clock.tick("reading")
         seen = points.stored(lambda values: values[:, : rank.view], *self._seen(points))
         labels, clusters = first_clusters(seen, self.num_clusters, rank.points, generator)
@@ -301,29 +303,28 @@ class _Group:
         rounding = torch.finfo(points.like.dtype).eps * norm
         limit = _LOSS * error if error > rounding else 0.0
         if limit < allowed:
-            del seen, members, points
-            found, points = self._projected(limit)  # the axes are the same and more of them
-            more = points.rest[1] - axes
+            del seen, members, points, found
+            found = self._projected(limit)  # the axes are the same and more of them
+            more = found.points.rest[1] - axes
             bases = Bases(torch.nn.functional.pad(bases.light, (0, 0, 0, more)), bases.dual)
             self.clock.tick("reading")
-        return found, points, labels, bases
+        return found, labels, bases
 
-    def _projected(self, allowed: float) -> tuple[Projection, Points]:
+    def _projected(self, allowed: float) -> Projection:
         """The tensor in as many axes as lose no more than allowed, and as tables fit in memory."""
         rank, options = self.rank, self.options
         wanted = self.moments.light.enough(allowed, rank.light)
         light = max(rank.light, min(wanted, self._affordable_light()))
-        memory = self._memory(light)
-        found = project(
+        return project(
             self.transfer,
             options.metric,
             self.moments,
             allowed=allowed,
             least=(rank.view, rank.light),
             most_light=light,
-            memory=memory,
+            memory=self._memory(light),
+            processes=options.processes,
         )
-        return found, Points(found.points, memory, options.processes)
 
     def _memory(self, light_axes: int) -> Memory:
         """The budget, less what labels, weights and tables take at their most."""

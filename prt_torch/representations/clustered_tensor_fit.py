@@ -255,7 +255,7 @@ def decompose(
 
 def exact_weights(
     members: SortedPoints, light: Float[Tensor, "clusters light light_rank"], dual: Tensor
-) -> Iterator[tuple[slice, Float[Tensor, "some point_rank"]]]:
+) -> Iterator[tuple[slice | Int[Tensor, "some"], Float[Tensor, "some point_rank"]]]:
     """Weights of every point in its own cluster, float64, chunk by chunk."""
     exact, columns = light.double(), dual.mT
     for chunk in members:

@@ -26,7 +26,7 @@ from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.exact_sums import ExactProducts
 from prt_torch.representations.points import Points
 from prt_torch.representations.processes import ALONE, Processes
-from prt_torch.representations.scratch import Memory, ScratchRows
+from prt_torch.representations.scratch import Memory
 from prt_torch.representations.steady import laid_out, steady_product
 from prt_torch.transfer import TransferTensor
 
@@ -95,13 +95,13 @@ class Projection:
     """The tensor in its first axes.
 
     Attributes:
-        points: Divided by the scale of the moments; this process's own.
+        points: ``"points view light"``, divided by the scale of the moments; this process's own.
         view_axes: Orthonormal columns.
         light_axes: Orthonormal columns.
         lost: Energy beyond the axes, over that of the tensor, as the moments tell; not below.
     """
 
-    points: Float[Tensor, "points view light"] | ScratchRows
+    points: Points
     view_axes: Float[Tensor, "rows view"]
     light_axes: Float[Tensor, "coeffs light"]
     lost: float
@@ -205,6 +205,7 @@ def project(
     most_light: int | None = None,
     memory_budget: int | None = None,
     memory: Memory | None = None,
+    processes: Processes = ALONE,
 ) -> Projection:
     """Keep the axes that matter.
 
@@ -219,6 +220,7 @@ def project(
             memory. Where ``allowed`` asks for more, fewer light axes are kept, and the result says
             what is lost.
         memory: What may be taken; points that do not fit lie in a temporary file.
+        processes: Those that have points too.
     """
     memory = memory or Memory()
     like = _at_least_single(transfer.values[0:0].flatten())
@@ -240,7 +242,8 @@ def project(
         across = lit.mT.reshape(-1, rows)
         points[some] = steady_product(across, by_view).view(count, light, view).mT
     beyond = float(moments.view.beyond[view] + moments.light.beyond[light])
-    return Projection(points, view_axes, light_axes, beyond / (moments.squared_norm or 1.0))
+    lost = beyond / (moments.squared_norm or 1.0)
+    return Projection(Points(points, memory, processes), view_axes, light_axes, lost)
 
 
 def _weighed(

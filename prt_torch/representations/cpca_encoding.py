@@ -148,7 +148,7 @@ def _centre(points: Points) -> Float[Tensor, "d"]:
         total += values.sum(0, dtype=torch.float64)
     mean = (points.processes.sum(total) / points.total).to(points.like)
     for rows, values in points.chunks():
-        points.rows[rows] = values - mean
+        points.write(rows, values - mean)
     return mean
 
 

@@ -153,7 +153,7 @@ def _products(blocks: Blocks, lift: Tensor | ScratchRows, points: Points) -> Non
         total = values.new_zeros(len(values), lift.shape[1])
         for rows in _tiles(lift):
             total += steady_product(values[:, rows], lift[rows])
-        points.rows[block] = total
+        points.write(block, total)
 
 
 def _images(

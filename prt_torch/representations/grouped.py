@@ -72,6 +72,7 @@ class ClusterBlocks(nn.Module):
     point_of_slot: Tensor
     cluster_of_slot: Tensor
     filled: Tensor
+    _by_size: Tensor | None
 
     def __init__(self, labels: Int[Tensor, "points"], num_clusters: int, *, slots_by: int = 1):
         super().__init__()

@@ -36,9 +36,7 @@ class Points:
         processes: Those that have points too.
     """
 
-    def __init__(
-        self, rows: Rows | ScratchRows, memory: Memory | None = None, processes: Processes = ALONE
-    ):
+    def __init__(self, rows: Rows, memory: Memory | None = None, processes: Processes = ALONE):
         self.rows, self.memory, self.processes = rows, memory or Memory(), processes
         self.num_points, self.rest = rows.shape[0], tuple(rows.shape[1:])
         lengths = processes.lengths(self.num_points)
@@ -109,7 +107,13 @@ class Points:
             room[rows] = function(values)
         return self.with_rows(room)
 
-    def with_rows(self, rows: Rows | ScratchRows) -> "Points":
+    def write(self, rows: slice, values: Float[Tensor, "some *rest"]) -> None:
+        """Replace some values, which must not be :class:`Mapped`."""
+        if not isinstance(self.rows, Tensor | ScratchRows):
+            raise ValueError(f"expected points that can be written, got {type(self.rows).__name__}")
+        self.rows[rows] = values
+
+    def with_rows(self, rows: Rows) -> "Points":
         """Other values of the same points."""
         return Points(rows, self.memory, self.processes)
 
@@ -124,7 +128,7 @@ class Mapped:
 
     def __init__(
         self,
-        rows: Rows | ScratchRows,
+        rows: Rows,
         function: Callable[[Tensor], Tensor],
         *rest: int,
     ):
@@ -188,7 +192,7 @@ class SortedPoints:
         """From now on, values are those less their cluster's mean; once."""
         self._means = means
         if self._kept is not None:
-            self._subtract(self._kept.blocks, self._kept.slots)
+            _subtract(self._kept, means)
 
     def __iter__(self) -> Iterator[SortedChunk]:
         if self._kept is not None:
@@ -207,18 +211,12 @@ class SortedPoints:
             taken = torch.nonzero(labels >= 0)[:, 0]
             labels, values, place = labels[taken], values[taken], rows.start + taken
         blocks = ClusterBlocks(labels, self.num_clusters, slots_by=STEADY_ROWS)
-        slots = values.index_select(0, blocks.point_of_slot)
+        chunk = SortedChunk(place, blocks, values.index_select(0, blocks.point_of_slot))
         if self._means is not None:
-            self._subtract(blocks, slots)
+            _subtract(chunk, self._means)
         else:
-            slots.index_fill_(0, blocks.padding, 0.0)
-        return SortedChunk(place, blocks, slots)
-
-    def _subtract(self, blocks: ClusterBlocks, slots: Tensor) -> None:
-        means = blocks.by_size(self._means)[:, None]
-        for clusters, (own,) in blocks.runs(slots):
-            own -= means[clusters]
-        slots.index_fill_(0, blocks.padding, 0.0)
+            chunk.slots.index_fill_(0, blocks.padding, 0.0)
+        return chunk
 
     def sum(self, of_chunk: Callable[[SortedChunk], Tensor], *shape: int) -> Tensor:
         """Sum over all chunks of all processes, float64, of results of this shape."""
@@ -263,6 +261,14 @@ class SortedPoints:
         for blocks, first, second in results():
             sums.add(blocks, first, second)
         return sums.value()
+
+
+def _subtract(chunk: SortedChunk, means: Float[Tensor, "clusters *rest"]) -> None:
+    """Take their cluster's mean off all points, in place."""
+    means = chunk.blocks.by_size(means)[:, None]
+    for clusters, (own,) in chunk.blocks.runs(chunk.slots):
+        own -= means[clusters]
+    chunk.slots.index_fill_(0, chunk.blocks.padding, 0.0)
 
 
 def label_type(num_clusters: int) -> torch.dtype:

@@ -144,4 +144,4 @@ class Memory:
 
 
 def _bytes_of(values: Tensor) -> memoryview:
-    return memoryview(values.flatten().view(torch.uint8).numpy())
+    return values.flatten().view(torch.uint8).numpy().data
