@@ -21,15 +21,20 @@ def far_groups(affine: bool, generator: torch.Generator) -> torch.Tensor:
 
 
 def test_clusters_move_to_where_they_are_missed():
-    """Groups 0 and 1 have seven of the clusters at first, and the other six share one."""
-    generator = torch.Generator().manual_seed(0)
-    data = far_groups(True, generator)
-    group = torch.arange(8).repeat_interleave(200)
-    labels = torch.where(group < 2, torch.arange(1600) % 7, 7)
-    labels = iterate(data, labels, 8, 2, True, generator)
-    found = decompose(data, labels, 8, 2, True)
-    noise = 1600 * 10 * 1e-6
-    assert found.error(torch.full((8,), 2)) < 1.1 * noise
+    """Groups 0 and 1 have seven of the clusters at first, and the other six share one.
+
+    Points that move one by one never solve this. About half of all starts do with relocation.
+    """
+    noise, solved = 1600 * 10 * 1e-6, 0
+    for seed in range(6):
+        generator = torch.Generator().manual_seed(seed)
+        data = far_groups(True, generator)
+        group = torch.arange(8).repeat_interleave(200)
+        labels = torch.where(group < 2, torch.arange(1600) % 7, 7)
+        labels = iterate(data, labels, 8, 2, True, generator)
+        found = decompose(data, labels, 8, 2, True)
+        solved += found.error(torch.full((8,), 2)) < 1.1 * noise
+    assert solved >= 2
 
 
 @pytest.mark.parametrize("affine", [True, False])
@@ -48,6 +53,7 @@ def test_the_choice_is_that_of_a_loop(affine):
         rest = rows - rows @ fit.vectors[k] @ fit.vectors[k].T
         table.append(rest.square().sum(1))
     losses, order = torch.stack(table, 1).sort(dim=1)
+    home = (order == labels[:, None]).int().argmax(1)  # place of the former cluster
     torch.testing.assert_close(choice.errors, losses[:, 0])
     assert torch.equal(choice.labels, order[:, 0])
     # The next best is the former cluster of a point that moves, else the true second.
@@ -55,7 +61,9 @@ def test_the_choice_is_that_of_a_loop(affine):
     assert 0 < int(stays.sum()) < 400
     assert torch.equal(choice.next_labels[stays], order[stays, 1])
     assert torch.equal(choice.next_labels[~stays], labels[~stays])
-    torch.testing.assert_close(choice.next_errors[stays], losses[stays, 1])
+    elsewhere = torch.where(stays, losses[:, 1], losses[torch.arange(400), home])
+    expected = torch.zeros(8, dtype=torch.float64).index_add_(0, choice.labels, elsewhere)
+    torch.testing.assert_close(choice.next_errors, expected)
 
 
 @pytest.mark.parametrize("affine", [True, False])

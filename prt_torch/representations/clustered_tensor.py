@@ -15,9 +15,11 @@ Source:
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import torch
+import torch.distributed as distributed
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -31,9 +33,14 @@ from prt_torch.representations.clustered_tensor_coding import (
     pack,
     unpack,
 )
-from prt_torch.representations.clustered_tensor_encoding import TensorStatistics, encode
+from prt_torch.representations.clustered_tensor_encoding import (
+    Options,
+    TensorStatistics,
+    encode,
+)
 from prt_torch.representations.coherence import draws, registers
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
+from prt_torch.representations.processes import Processes
 from prt_torch.representations.products import matmul_few
 from prt_torch.transfer import Surface, TransferTensor
 
@@ -75,12 +82,11 @@ class ClusteredTensor(CodedRepresentation):
         self.bits: Literal[16] | None = None if encoding.steps is None else BITS
         self.statistics: TensorStatistics | None = None
         self._condition = encoding.condition
-        self.blocks = ClusterBlocks(encoding.labels, len(encoding.parameters.cores))
+        self._blocks: ClusterBlocks | None = None
         self.register_buffer("labels", encoding.labels)
         self.register_buffer("groups", encoding.groups)
         for name in Parameters.names():
-            values = getattr(encoding.parameters, name).detach()
-            values = values.clone(memory_format=torch.contiguous_format)
+            values = getattr(encoding.parameters, name).detach().contiguous()
             self.register_parameter(name, nn.Parameter(values))
             steps = None if encoding.steps is None else getattr(encoding.steps, name)
             self.register_buffer(f"_{name}_steps", steps)
@@ -97,6 +103,7 @@ class ClusteredTensor(CodedRepresentation):
         tolerance: float = 1e-4,
         max_turns: int = 40,
         memory_budget: int = 4 * 2**30,
+        process_group: distributed.ProcessGroup | None = None,
         metric: Metric | None = None,
         generator: torch.Generator | None = None,
     ) -> "ClusteredTensor":
@@ -105,7 +112,8 @@ class ClusteredTensor(CodedRepresentation):
         Points of different materials (``transfer.surface.materials``) share no cluster.
 
         Args:
-            transfer: The tensor to stand for; read by blocks, two or three times over.
+            transfer: The tensor to stand for; read by blocks, three or four times over. With a
+                ``process_group``, the points of this process.
             num_clusters: At least 1 of each material; fewer are made if there are fewer distinct
                 points. They are shared out to materials by squared norm.
             ranks: Of rows (times channels), light coefficients and points of a cluster, at least 1
@@ -115,15 +123,24 @@ class ClusteredTensor(CodedRepresentation):
             tolerance: A turn that lowers the squared error by less than this share of it ends a
                 phase.
             max_turns: Of each of the two phases.
-            memory_budget: Bytes for the points in their principal axes and what is made of them.
-                Where it is short, fewer light axes are kept than the error asks for, and
-                ``statistics.projection_lost`` says what that costs.
+            memory_budget: Bytes that all of this may take at its peak, the result included and what
+                was there before left out. Where it is short, points are kept in a temporary file
+                (``TMPDIR``) and read in chunks, which takes longer and changes the result by
+                rounding only; where even tables of all clusters are large beside it, fewer light
+                axes are kept than the error asks for, and ``statistics.projection_lost`` says what
+                that costs. Tables for fast evaluation are made at the first call, outside of it.
+            process_group: Processes that share the work, each with points of its own, in order of
+                rank; every process makes this call with the same options. The result has all
+                clusters and this process's points (:meth:`gathered` makes one of all), and the
+                clusters are those of one process with all points, to rounding.
             metric: What errors are worth; the L2 norm over light directions if not given.
             generator: Source of randomness; seed 0 if not given.
 
         Raises:
             ValueError: If an option is out of range.
-            InputError: If there are fewer clusters than materials.
+            InputError: If there are fewer clusters than materials, or ``memory_budget`` is less
+                than the fit needs in any case: what labels, weights and tables of all clusters
+                take.
 
         Source:
             Tsai, Shih 2006, section 5.2. Clusters begin as those of linear CPCA where the paper has
@@ -133,17 +150,20 @@ class ClusteredTensor(CodedRepresentation):
         """
         _check(num_clusters, ranks, bits, tolerance, max_turns)
         rows, coeffs, points = ranks
-        encoding, statistics = encode(
-            transfer,
-            num_clusters=num_clusters,
-            ranks=(rows, coeffs, points),
+        processes = Processes(process_group)
+        options = Options(
             tolerance=tolerance,
             max_turns=max_turns,
             memory_budget=memory_budget,
             metric=metric or Metric.l2(transfer),
             generator=generator or torch.Generator().manual_seed(0),
+            processes=processes,
         )
-        encoding = encoding if bits is None else encoding.coded()
+        wanted = (rows, coeffs, points)
+        encoding, statistics = encode(
+            transfer, num_clusters=num_clusters, ranks=wanted, options=options
+        )
+        encoding = encoding if bits is None else encoding.coded(processes)
         found = cls(encoding, transfer.surface, tuple(transfer.values.shape))
         found.statistics = statistics
         return found
@@ -164,6 +184,34 @@ class ClusteredTensor(CodedRepresentation):
         encoding = self._encoding()
         rounds = self.training and not self._at_rest
         return encoding.straight_through() if rounds else encoding.parameters
+
+    def gathered(self, process_group: distributed.ProcessGroup | None) -> "ClusteredTensor":
+        """One model of all processes' points, on every process, from what each has fitted.
+
+        Args:
+            process_group: The one that :meth:`from_transfer` was given; points are in order of
+                rank.
+        """
+        processes, own = Processes(process_group), self._encoding()
+        values = {name: getattr(own.parameters, name).detach() for name in Parameters.names()}
+        values = {name: one.clone() for name, one in values.items() if name != "weights"}
+        weights = processes.gather(self.weights.detach())
+        encoding = replace(
+            own,
+            labels=processes.gather(self.labels),
+            parameters=Parameters(**values, weights=weights),
+        )
+        surface = processes.gather_surface(self.surface, self.num_points)
+        found = ClusteredTensor(encoding, surface, (len(weights), *self.shape[1:]))
+        found.statistics = self.statistics
+        return found
+
+    @property
+    def blocks(self) -> ClusterBlocks:
+        """Points sorted by cluster; made where first needed, as it takes more than the labels."""
+        if self._blocks is None:
+            self._blocks = ClusterBlocks(self.labels, self.num_clusters)
+        return self._blocks
 
     @property
     def num_clusters(self) -> int:

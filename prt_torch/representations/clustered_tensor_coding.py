@@ -22,6 +22,8 @@ from prt_torch.quantize import (
     rounded_up,
     straight_through,
 )
+from prt_torch.representations.points import slices
+from prt_torch.representations.processes import ALONE, Processes
 from prt_torch.representations.segmented_quantisation import weight_steps
 
 BITS = 16
@@ -59,11 +61,21 @@ class Steps:
     weights: Float[Tensor, "clusters rank"]
 
     @classmethod
-    def at_full_scale(cls, parameters: Parameters, labels: Int[Tensor, "points"]) -> "Steps":
-        """The finest at which no value is clamped."""
+    def at_full_scale(
+        cls,
+        parameters: Parameters,
+        labels: Int[Tensor, "points"],
+        processes: Processes = ALONE,
+    ) -> "Steps":
+        """The finest at which no value is clamped, whatever process it is on."""
         clusters, rank = parameters.cores.shape[:2]
-        entries = labels[:, None] * rank + torch.arange(rank, device=labels.device)
-        flat = weight_steps(parameters.weights.flatten(), entries.flatten(), clusters * rank, BITS)
+        largest = parameters.weights.new_zeros(clusters, rank)
+        for some in slices(len(labels)):
+            magnitudes = parameters.weights[some].abs()
+            entries = labels[some, None].expand(-1, rank)
+            largest.scatter_reduce_(0, entries, magnitudes, "amax")
+        every = torch.arange(clusters * rank, device=labels.device)
+        flat = weight_steps(processes.largest(largest).flatten(), every, clusters * rank, BITS)
         return cls(
             view_basis=_full_scale(parameters.view_basis, (1,)),
             light_bases=_full_scale(parameters.light_bases, (2,)),
@@ -99,19 +111,32 @@ class Encoding:
     steps: Steps | None
     condition: float
 
-    def coded(self) -> "Encoding":
-        """With the finest steps, values at multiples of them."""
-        return replace(self, steps=Steps.at_full_scale(self.parameters, self.labels)).rounded()
+    def coded(self, processes: Processes = ALONE) -> "Encoding":
+        """With the finest steps, values at multiples of them; weights are rounded in place.
+
+        Args:
+            processes: Those that have points too.
+        """
+        steps = Steps.at_full_scale(self.parameters, self.labels, processes)
+        return replace(self, steps=steps)._rounded(self.parameters.weights)
 
     def rounded(self) -> "Encoding":
         """The same with values at the multiples of their steps, if there are steps."""
-        if self.steps is None:
+        return self._rounded(torch.empty_like(self.parameters.weights))
+
+    def _rounded(self, weights: Float[Tensor, "points rank"]) -> "Encoding":
+        """The same, with room for the weights."""
+        steps, own = self.steps, self.parameters
+        if steps is None:
             return self
+        for some in slices(len(weights)):
+            weights[some] = _at_multiples(own.weights[some], steps.weights[self.labels[some]])
         values = {
-            name: dequantize(quantize(own, step, BITS), step, own.dtype)
-            for name, (own, step) in self._pairs(self.steps).items()
+            name: _at_multiples(getattr(own, name), getattr(steps, name))
+            for name in Parameters.names()
+            if name != "weights"
         }
-        return replace(self, parameters=Parameters(**values))
+        return replace(self, parameters=Parameters(**values, weights=weights))
 
     def straight_through(self) -> Parameters:
         """The same values, whose gradients pass as if nothing were rounded."""
@@ -125,6 +150,11 @@ class Encoding:
         """Each parameter with its steps."""
         by_value = steps.by_value(self.labels)
         return {name: (getattr(self.parameters, name), step) for name, step in by_value.items()}
+
+
+def _at_multiples(values: Tensor, step: Tensor) -> Tensor:
+    """The nearest values that codes can have."""
+    return dequantize(quantize(values, step, BITS), step, values.dtype)
 
 
 def pack(encoding: Encoding) -> dict[str, Tensor]:
@@ -152,7 +182,7 @@ def unpack(packed: dict[str, Tensor]) -> Encoding:
     """The inverse of :func:`pack`."""
     labels, names = packed["labels"].long(), Parameters.names()
     if "weights" in packed:
-        parameters = Parameters(**{name: packed[name] for name in names})
+        parameters = Parameters(**{name: packed[name].clone() for name in names})
         return Encoding(labels, _groups(packed, parameters), parameters, None, float("nan"))
     steps = Steps(**{name: packed[f"{name}_steps"] for name in names})
     values = {

@@ -15,15 +15,18 @@ Source:
     Tsai, Shih 2006, sections 5.2.3 and 5.2.4; De Lathauwer et al. 2000 (the iteration).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from prt_torch.representations.cpca_subspaces import one_thread, principal
-from prt_torch.representations.grouped import ClusterBlocks
+from prt_torch.representations.cpca_subspaces import condensed, one_thread, principal
 from prt_torch.representations.orthonormal import orthonormal
+from prt_torch.representations.points import Points, SortedChunk, SortedPoints, cluster_sizes
+from prt_torch.representations.steady import laid_out, steady_product
+from prt_torch.representations.whitening import whitening
 
 _STIFF = {torch.float64: 1e3, torch.float32: 1e5}  # as in cpca_subspaces
 
@@ -52,7 +55,7 @@ class Bases:
         clusters, rank, _ = self.dual.shape
         dual = self.dual.reshape(clusters, -1, self.light.shape[2])  # rank times view, light
         columns = (dual @ self.light.mT).view(clusters, rank, -1)
-        return columns.mT.contiguous()
+        return laid_out(columns.mT)
 
 
 def first_bases(
@@ -69,97 +72,138 @@ def first_bases(
     dual = torch.randn(view_rank * light_rank, point_rank, generator=generator)
     dual = orthonormal(dual.double()).mT
     return Bases(
-        light.to(like).expand(num_clusters, -1, -1),
-        dual.to(like).expand(num_clusters, -1, -1),
+        laid_out(light.to(like).expand(num_clusters, -1, -1)),
+        laid_out(dual.to(like).expand(num_clusters, -1, -1)),
     )
 
 
 def weights(
-    blocks: ClusterBlocks,
-    slots: Float[Tensor, "slots view light"],
-    columns: Float[Tensor, "clusters view_times_light point_rank"],
+    chunk: SortedChunk, columns: Float[Tensor, "clusters view_times_light point_rank"]
 ) -> Float[Tensor, "slots point_rank"]:
     """Each slot's point in the columns (:meth:`Bases.together`) of its place: equation 17."""
-    return blocks.matmul(slots.flatten(1), columns)
+    return chunk.matmul(chunk.slots.flatten(1), columns)
 
 
-def _point_bases(
-    blocks: ClusterBlocks, weights: Float[Tensor, "slots point_rank"]
-) -> Float[Tensor, "slots point_rank"]:
-    """Orthonormal columns over each cluster's points; zero where it has fewer of them."""
-    rank = weights.shape[1]
-    bases = [orthonormal(rows) for rows in blocks.by_bucket(weights)]
-    padded = [torch.nn.functional.pad(one, (0, rank - one.shape[2])) for one in bases]
-    return torch.cat([one.flatten(0, 1) for one in padded])
+def held(members: SortedPoints, bases: Bases) -> float:
+    """Squared norm of what the bases hold of the tensor."""
+    columns = bases.together()
+
+    def of_chunk(chunk: SortedChunk) -> Tensor:
+        return weights(chunk, columns).square().sum(dtype=torch.float64)
+
+    return float(members.sum(of_chunk))
 
 
-def refit(
-    blocks: ClusterBlocks, slots: Float[Tensor, "slots view light"], bases: Bases, steps: int
-) -> Bases:
+def refit(members: SortedPoints, bases: Bases, steps: int) -> Bases:
     """One turn over light and points, each by so many steps; the error never rises.
 
     Rounding aside: the points' basis holds the weights, the light's step starts from the basis
-    that they were made with, and the dual basis holds the core of both.
+    that they were made with, and the dual basis holds the core of both. The points' basis itself
+    is never formed: all that is asked of it are its products with the points, which are those of
+    the weights but for a small matrix (:mod:`prt_torch.representations.whitening`).
+
+    Args:
+        members: Points ``"view light"`` by cluster.
+        bases: To improve.
+        steps: Of each mode.
     """
-    light, dual = bases.light, bases.dual
-    within = blocks.matmul(slots, light).flatten(1)
-    own = _point_bases(blocks, blocks.matmul(within, dual.mT))
+    dual, clusters = bases.dual, len(bases.light)
     for _ in range(steps - 1):
-        dual = orthonormal(blocks.transposed_matmul(own, within).mT).mT
-        own = _point_bases(blocks, blocks.matmul(within, dual.mT))
-    compressed = blocks.transposed_matmul(own, slots.flatten(1))
-    compressed = compressed.view(len(light), -1, slots.shape[2])
+        dual = _dual_step(members, bases.light, dual)
+    compressed = _compressed(members, bases.light, dual)
+    compressed = compressed.view(clusters, -1, bases.light.shape[1])
+    light = bases.light.double()
     for _ in range(steps):
         light = orthonormal(compressed.mT @ (compressed @ light))
-    core = (compressed @ light).view(len(light), dual.shape[1], -1)
-    return Bases(light, orthonormal(core.mT).mT)
+    core = (compressed @ light).view(clusters, dual.shape[1], -1)
+    return Bases(laid_out(light.to(dual)), laid_out(orthonormal(core.mT).mT.to(dual)))
+
+
+def _dual_step(
+    members: SortedPoints,
+    light: Float[Tensor, "clusters light light_rank"],
+    dual: Float[Tensor, "clusters point_rank view_times_light_rank"],
+) -> Float[Tensor, "clusters point_rank view_times_light_rank"]:
+    """One step of orthogonal iteration of the mode of the points."""
+    columns = laid_out(dual.mT)
+
+    def of_chunk(chunk: SortedChunk) -> tuple[Tensor, Tensor]:
+        within = chunk.matmul(chunk.slots, light).flatten(1)
+        return chunk.matmul(within, columns), within
+
+    moved = members.products(of_chunk, *dual.shape[1:])
+    return laid_out(orthonormal(moved.mT).mT.to(dual))
+
+
+def _compressed(
+    members: SortedPoints,
+    light: Float[Tensor, "clusters light light_rank"],
+    dual: Float[Tensor, "clusters point_rank view_times_light_rank"],
+) -> Float[Tensor, "clusters point_rank view_times_light"]:
+    """Products of the points with an orthonormal basis of their weights, float64."""
+    columns, rank = Bases(light, dual).together(), dual.shape[1]
+
+    def of_chunk(chunk: SortedChunk) -> tuple[Tensor, Tensor]:
+        own = weights(chunk, columns)
+        return own, torch.cat([chunk.slots.flatten(1), own], dim=1)
+
+    total = members.products(of_chunk, rank, columns.shape[1] + rank)
+    products, gram = total.split([columns.shape[1], rank], dim=2)
+    return whitening(gram).mT @ products
 
 
 def refit_view(
-    blocks: ClusterBlocks,
-    points: Float[Tensor, "points view_axes light"],
-    view: Float[Tensor, "view_axes view"],
-    bases: Bases,
+    members: SortedPoints, view: Float[Tensor, "view_axes view"], bases: Bases
 ) -> tuple[Float[Tensor, "view_axes view"], Bases]:
     """The best view basis for the points' and light's; the dual basis follows it.
+
+    Args:
+        members: Points ``"view_axes light"`` by cluster.
+        view: Basis of the view to improve.
+        bases: In that view.
 
     Source:
         Tsai, Shih 2006, equation 19.
     """
-    slots = blocks.to_slots(in_view(points, view))
-    own = _point_bases(blocks, weights(blocks, slots, bases.together()))
-    rows = [  # one at a time, as all of them sorted by cluster would double the memory
-        blocks.transposed_matmul(own, blocks.to_slots(row)) @ bases.light
-        for row in points.unbind(1)
-    ]
-    core = torch.stack(rows)  # view axes, clusters, points, light
-    flat = core.flatten(1).double()
+    columns, (clusters, rank, _) = bases.together(), bases.dual.shape
+    axes, width = len(view), len(view) * bases.light.shape[2]
+
+    def of_chunk(chunk: SortedChunk) -> tuple[Tensor, Tensor]:
+        seen = SortedChunk(chunk.rows, chunk.blocks, in_view(chunk.slots, view))
+        own, lit = weights(seen, columns), chunk.matmul(chunk.slots, bases.light).flatten(1)
+        return own, torch.cat([lit, own], dim=1)
+
+    total = members.products(of_chunk, rank, width + rank)
+    products, gram = total.split([width, rank], dim=2)
+    core = (whitening(gram).mT @ products).view(clusters, rank, axes, -1)
+    flat = core.movedim(2, 0).flatten(1)
     with one_thread():
-        view = torch.linalg.eigh(flat @ flat.mT)[1].flip(1)[:, : view.shape[1]].to(view)
-    core = torch.einsum("acpl,av->cpvl", core, view).flatten(2)
-    return view, Bases(bases.light, orthonormal(core.mT).mT)
+        found = torch.linalg.eigh(flat @ flat.mT)[1].flip(1)[:, : view.shape[1]]
+    core = torch.einsum("cpal,av->cpvl", core, found).flatten(2)
+    dual = orthonormal(core.mT).mT
+    return laid_out(found.to(view)), Bases(bases.light, laid_out(dual.to(view)))
 
 
 def in_view(
     points: Float[Tensor, "points view_axes light"], view: Float[Tensor, "view_axes view"]
 ) -> Float[Tensor, "points view light"]:
     """Points in a view basis: equation 14."""
-    return view.mT @ points
+    count, axes, light = points.shape
+    across = points.mT.reshape(-1, axes)
+    return laid_out(steady_product(across, view).view(count, light, view.shape[1]).mT)
 
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Exact dual bases and weights for given bases of view and light, float64.
+    """Exact dual bases for given bases of view and light, float64.
 
     Attributes:
         dual: Rows are right singular vectors; zero beyond the numerical rank.
         singular: Their singular values, falling.
-        weights: Of every point in its own cluster.
     """
 
     dual: Float[Tensor, "clusters point_rank view_times_light_rank"]
     singular: Float[Tensor, "clusters point_rank"]
-    weights: Float[Tensor, "points point_rank"]
 
     @property
     def condition(self) -> float:
@@ -167,10 +211,15 @@ class Decomposition:
         smallest = torch.where(self.singular > 0, self.singular, torch.inf).amin(1)
         return float((self.singular[:, 0] / smallest).max().clamp_min(1.0))
 
+    @property
+    def squared_norm(self) -> float:
+        """Of the weights, so of what is held of the tensor."""
+        return float(self.singular.square().sum())
+
 
 def decompose(
-    blocks: ClusterBlocks,
-    slots: Float[Tensor, "slots view light"],
+    points: Points,
+    labels: Int[Tensor, "points"],
     light: Float[Tensor, "clusters light light_rank"],
     point_rank: int,
 ) -> Decomposition:
@@ -178,13 +227,37 @@ def decompose(
 
     Vectors that no cluster has a use for are left out.
 
+    Args:
+        points: In the view basis, ``"points view light"``.
+        labels: Their clusters.
+        light: Light basis of each.
+        point_rank: Vectors at most.
+
     Source:
         Tsai, Shih 2006, equations 15 to 17.
     """
-    within = blocks.matmul(slots, light).flatten(1).double()
-    found = [principal(rows, point_rank, _STIFF[slots.dtype]) for rows in blocks.by_bucket(within)]
-    singular = torch.cat([values for values, _ in found])
-    dual = torch.cat([vectors for _, vectors in found])
+    clusters, exact = len(light), light.double()
+    sizes = cluster_sizes(labels, clusters, points.processes)
+    width = points.rest[0] * light.shape[2]
+
+    def within(members: Tensor, cluster: int) -> Tensor:
+        return (members.double() @ exact[cluster]).flatten(1)
+
+    singular = exact.new_zeros(clusters, point_rank)
+    dual = exact.new_zeros(clusters, point_rank, width)
+    stiff = _STIFF[points.like.dtype]
+    for cluster, rows in condensed(points, labels, sizes, within, width):
+        values, vectors = principal(rows[None], point_rank, stiff)
+        singular[cluster], dual[cluster] = values[0], vectors[0]
     used = max(1, int((singular > 0).sum(1).max()))
-    singular, dual = singular[:, :used], dual[:, :used]
-    return Decomposition(dual, singular, blocks.to_points(blocks.matmul(within, dual.mT)))
+    return Decomposition(dual[:, :used], singular[:, :used])
+
+
+def exact_weights(
+    members: SortedPoints, light: Float[Tensor, "clusters light light_rank"], dual: Tensor
+) -> Iterator[tuple[slice | Int[Tensor, "some"], Float[Tensor, "some point_rank"]]]:
+    """Weights of every point in its own cluster, float64, chunk by chunk."""
+    exact, columns = light.double(), dual.mT
+    for chunk in members:
+        within = chunk.blocks.matmul(chunk.slots.double(), exact).flatten(1)
+        yield chunk.rows, chunk.blocks.to_points(chunk.blocks.matmul(within, columns))

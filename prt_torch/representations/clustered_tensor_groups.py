@@ -23,17 +23,22 @@ from torch.nn.functional import pad
 
 from prt_torch.errors import InputError
 from prt_torch.representations.clustered_tensor_coding import Encoding, Parameters
-from prt_torch.representations.grouped import sort_labels
+from prt_torch.representations.points import renumber
+from prt_torch.representations.processes import ALONE, Processes
 from prt_torch.transfer import Rows, Surface, TransferTensor
 
 
-def split(transfer: TransferTensor) -> list[tuple[Int[Tensor, "_"], TransferTensor]]:
-    """The points of each material that occurs, and their transfer, read where it is asked for."""
-    every = torch.arange(transfer.num_points)
+def split(
+    transfer: TransferTensor, processes: Processes = ALONE
+) -> list[tuple[Int[Tensor, "_"], TransferTensor]]:
+    """The points of each material that occurs, and their transfer, read where it is asked for.
+
+    A process may have no points of a material that others have.
+    """
     materials = transfer.surface.materials
-    kinds = [] if materials is None else materials.unique()
+    kinds = [] if materials is None else processes.gather(materials.unique()).unique()
     if materials is None or len(kinds) < 2:
-        return [(every, transfer)]
+        return [(torch.arange(transfer.num_points), transfer)]
     bases = Surface(transfer.surface.exit_basis, transfer.surface.light_basis)
     groups = [torch.nonzero(materials == kind)[:, 0] for kind in kinds]
     return [(own, TransferTensor(_Some(transfer.values, own), bases)) for own in groups]
@@ -48,6 +53,8 @@ class _Some:
 
     def __getitem__(self, rows: slice, /) -> Tensor:
         points = self._points[rows].cpu()
+        if len(points) == 0:
+            return self._values[0:0]
         borders = torch.nonzero(points.diff() != 1)[:, 0] + 1
         runs = [run.tolist() for run in points.tensor_split(borders)]
         return torch.cat([self._values[run[0] : run[-1] + 1] for run in runs])
@@ -75,12 +82,17 @@ def share_out(num_clusters: int, squared_norms: Sequence[float], sizes: Sequence
     return counts
 
 
-def join(parts: Sequence[tuple[Int[Tensor, "_"], Encoding]]) -> Encoding:
+def join(
+    parts: Sequence[tuple[Int[Tensor, "_"], Encoding]], processes: Processes = ALONE
+) -> Encoding:
     """One encoding of all points from those of the groups, in which nothing is rounded yet.
 
     Args:
         parts: Points of each group, and their encoding with one view basis.
+        processes: Those that have points too.
     """
+    if len(parts) == 1:
+        return parts[0][1]
     each = [encoding.parameters for _, encoding in parts]
     counts = [len(one.cores) for one in each]
     shapes = zip(*(one.cores.shape[1:] for one in each), strict=True)
@@ -93,7 +105,7 @@ def join(parts: Sequence[tuple[Int[Tensor, "_"], Encoding]]) -> Encoding:
         labels[points] = encoding.labels + first
         weights[points] = _filled_up(encoding.parameters.weights, rank)
         first += count
-    labels, old = sort_labels(labels, first)
+    labels, old = renumber(labels, first, processes)
     numbers = [old.new_full((count,), group) for group, count in enumerate(counts)]
     light_bases = [_filled_up(one.light_bases, light, one.light_bases.shape[2]) for one in each]
     return Encoding(

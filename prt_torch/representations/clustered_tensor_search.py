@@ -10,6 +10,7 @@ Source:
     clusters by distances to means.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -17,19 +18,27 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from prt_torch.representations.clustered_tensor_fit import Bases, refit, weights
-from prt_torch.representations.cpca_clusters import refill, vector_quantise
+from prt_torch.representations.cpca_clusters import count_moves, refill, vector_quantise
 from prt_torch.representations.cpca_iteration import iterate
-from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.representations.orthonormal import orthonormal
+from prt_torch.representations.points import (
+    Points,
+    SortedChunk,
+    SortedPoints,
+    cluster_sizes,
+    renumber,
+)
 
 NEAREST = 8
 """Clusters a point may move to in one turn, its own included."""
+
+START_DIMENSIONS = 256
+"""Of the points that the first clusters are made of."""
 
 _FIRST_STEPS = 3  # of the turn that has only a start
 _STEPS = 2
 _FEW_MOVES = 2e-3  # share of points; below it turns end
 _LOOKS = 2  # at all clusters, at most
-_START_DIMENSIONS = 256
 _ROUNDING = 4.0  # units of rounding by which another cluster must be better
 
 
@@ -55,7 +64,7 @@ class Trace:
 
 
 def first_clusters(
-    points: Float[Tensor, "points view light"],
+    points: Points,
     num_clusters: int,
     rank: int,
     generator: torch.Generator,
@@ -65,6 +74,12 @@ def first_clusters(
     These know nothing of ranks of view and light, but of all else: on glossy transfer they left a
     handful of turns to do, and a lower error than dozens of turns from Lloyd's clusters.
 
+    Args:
+        points: In view and light, ``"points view light"``.
+        num_clusters: Clusters at most.
+        rank: Of their subspaces.
+        generator: Source of randomness.
+
     Returns:
         Cluster of each point, numbered from the largest to the smallest, and how many there are:
         no more than distinct points.
@@ -72,17 +87,18 @@ def first_clusters(
     Source:
         Tsai, Shih 2006, section 5.2.2, has ELBG's clusters, by distances to means.
     """
-    leading = max(1, _START_DIMENSIONS // points.shape[1])
-    data = points[:, :, :leading].flatten(1)
+    view, light = points.rest
+    leading = min(light, max(1, START_DIMENSIONS // view))
+    data = points.stored(lambda values: values[:, :, :leading].flatten(1), view * leading)
     labels, num_clusters = vector_quantise(data, num_clusters, generator, rough=True)
     if num_clusters > 1:
-        rank = min(rank, data.shape[1])
+        rank = min(rank, view * leading)
         labels = iterate(data, labels, num_clusters, rank, False, generator, doubling=True)
-    return sort_labels(labels, num_clusters)[0], num_clusters
+    return renumber(labels, num_clusters, points.processes)[0], num_clusters
 
 
 def find_clusters(
-    points: Float[Tensor, "points view light"],
+    points: Points,
     labels: Int[Tensor, "points"],
     bases: Bases,
     trace: Trace,
@@ -94,7 +110,7 @@ def find_clusters(
     """Move points between clusters until few of them do.
 
     Args:
-        points: In the view basis that all clusters share.
+        points: In the view basis that all clusters share, ``"points view light"``.
         labels: Clusters to begin with, none empty.
         bases: Of every cluster, to begin with.
         trace: Is told of every turn.
@@ -106,52 +122,46 @@ def find_clusters(
     Returns:
         Labels, clusters numbered from the largest to the smallest, and their bases.
     """
-    num_clusters = len(bases.light)
-    few, looks = _FEW_MOVES * len(points), 0 if num_clusters > NEAREST else _LOOKS
+    num_clusters, processes = len(bases.light), points.processes
+    few, looks = _FEW_MOVES * points.total, 0 if num_clusters > NEAREST else _LOOKS
     for turn in range(max_turns):
-        labels, old = sort_labels(labels, num_clusters)
-        grouped = _Grouped(points, labels, bases.of(old))
+        grouped = _Grouped(points, labels, bases)
         grouped.refit(_FIRST_STEPS if turn == 0 else _STEPS)
         labels, held = grouped.move(NEAREST)
         trace.held.append(held)
-        moved = int((labels != grouped.labels).sum())
+        moved = count_moves(labels, grouped.labels, processes)
         still = moved <= few or trace.settled(squared_norm, tolerance)
         if (still or turn == max_turns - 1) and looks < _LOOKS:
             labels, trace.held[-1] = grouped.move(num_clusters)
-            moved = int((labels != grouped.labels).sum())
+            moved = count_moves(labels, grouped.labels, processes)
             looks += 1
             still = moved <= few or trace.settled(squared_norm, tolerance)
         bases = grouped.restarted(labels)
         trace.moved.append(moved)
         if still:
             break
-    labels, old = sort_labels(labels, num_clusters)
+    labels, old = renumber(labels, num_clusters, processes)
     return labels, bases.of(old)
 
 
 class _Grouped:
-    """Points sorted by cluster, with the clusters' bases.
+    """Points by cluster, with the clusters' bases.
 
     Args:
         points: In the view basis.
-        labels: Clusters numbered from the largest to the smallest.
+        labels: Their clusters.
         bases: Of every cluster.
     """
 
-    def __init__(self, points: Tensor, labels: Tensor, bases: Bases):
+    def __init__(self, points: Points, labels: Int[Tensor, "points"], bases: Bases):
         self.points, self.labels, self.bases = points, labels, bases
         self.num_clusters = len(bases.light)
-        self.blocks = ClusterBlocks(labels, self.num_clusters)
-        self.slots = self.blocks.to_slots(points)
-        self._emptied = labels[:0]
+        self.members = SortedPoints(points, labels, self.num_clusters)
+        self._emptied: list[int] = []
 
     def refit(self, steps: int) -> None:
         """Improve the bases."""
-        self.bases = refit(self.blocks, self.slots, self.bases, steps)
-
-    def _held(self, columns: Float[Tensor, "clusters values rank"]) -> Float[Tensor, "slots"]:
-        """Squared norm of what each slot's point keeps in the columns of its place."""
-        return weights(self.blocks, self.slots, columns).square().sum(1)
+        self.bases = refit(self.members, self.bases, steps)
 
     def move(self, count: int) -> tuple[Int[Tensor, "points"], float]:
         """The best cluster of each point among those nearest to its own; none is left empty.
@@ -163,30 +173,30 @@ class _Grouped:
             New labels, and the squared norm of what the bases hold with them.
         """
         nearest = self._nearest(min(count, self.num_clusters))
-        home = self.blocks.cluster_of_slot
-        columns = self.bases.together()
-        best, labels = self._held(columns), home
-        better = 1.0 + _ROUNDING * torch.finfo(best.dtype).eps
-        for clusters in nearest.unbind(1)[1:]:
-            held = self._held(columns[clusters])
-            moves = held > better * best
-            best, labels = (
-                torch.where(moves, held, best),
-                torch.where(moves, clusters[home], labels),
-            )
-        squares = torch.linalg.vector_norm(self.slots, dim=(1, 2)).square()
-        errors = self.blocks.to_points(squares - best).clamp_min(0.0)
-        labels = self.blocks.to_points(labels)
-        sizes = torch.bincount(labels, minlength=self.num_clusters)
-        self._emptied = torch.nonzero(sizes == 0)[:, 0]
-        held = float(best.sum(dtype=torch.float64))
-        return refill(labels, errors, self.num_clusters), held
+        columns, processes = self.bases.together(), self.points.processes
+        labels = torch.empty_like(self.labels)
+        errors = self.points.like.new_empty(len(labels))
+        held = errors.new_zeros((), dtype=torch.float64)
+        for chunk in self.members:
+            best, to = _best(chunk, nearest, columns)
+            squares = torch.linalg.vector_norm(chunk.slots, dim=(1, 2)).square()
+            errors[chunk.rows] = chunk.blocks.to_points(squares - best).clamp_min(0.0)
+            labels[chunk.rows] = chunk.blocks.to_points(to).to(labels.dtype)
+            held += best.sum(dtype=torch.float64)
+        sizes = cluster_sizes(labels, self.num_clusters, processes)
+        self._emptied = torch.nonzero(sizes == 0)[:, 0].tolist()
+        labels = refill(labels, errors, self.num_clusters, processes)
+        return labels, float(processes.sum(held))
 
     def _nearest(self, count: int) -> Int[Tensor, "clusters count"]:
         """Clusters by the distance of their means, each itself first."""
-        filled = self.blocks.filled.to(self.slots)[:, None]
-        sums = self.blocks.transposed_matmul(filled, self.slots.flatten(1))[:, 0]
-        centres = sums / self.blocks.sizes().clamp_min(1)[:, None]
+
+        def sums(chunk: SortedChunk) -> Tensor:
+            return chunk.blocks.sum(chunk.slots.flatten(1))
+
+        shape = (self.num_clusters, math.prod(self.points.rest))
+        sizes = cluster_sizes(self.labels, self.num_clusters, self.points.processes)
+        centres = self.members.sum(sums, *shape) / sizes.clamp_min(1)[:, None]
         distances = torch.cdist(centres, centres)
         distances.fill_diagonal_(-1.0)
         return distances.topk(count, largest=False).indices
@@ -194,10 +204,9 @@ class _Grouped:
     def restarted(self, labels: Int[Tensor, "points"]) -> Bases:
         """The bases, those of clusters that had lost all their points led by their new one."""
         emptied = self._emptied
-        if len(emptied) == 0:
+        if not emptied:
             return self.bases
-        places = torch.searchsorted(labels.sort().values, emptied)
-        own = self.points[labels.argsort(stable=True)[places]]  # some, view, light
+        own = self.points.take(self._first_members(labels, emptied))  # some, view, light
         light, dual = self.bases.light.clone(), self.bases.dual.clone()
         rights = torch.linalg.svd(own, full_matrices=False)[2].mT
         led = orthonormal(torch.cat([rights, light[emptied]], dim=2))
@@ -206,3 +215,31 @@ class _Grouped:
         led = orthonormal(torch.cat([core, dual[emptied]], dim=1).mT).mT
         dual[emptied] = led[:, : dual.shape[1]]
         return Bases(light, dual)
+
+    def _first_members(
+        self, labels: Int[Tensor, "points"], clusters: list[int]
+    ) -> Int[Tensor, "some"]:
+        """The first point of each cluster, by number over all processes."""
+        first = torch.full((len(clusters),), -1, device=labels.device)
+        for place, cluster in enumerate(clusters):
+            own = torch.nonzero(labels == cluster)[:1, 0]
+            if len(own):
+                first[place] = self.points.total - self.points.first - own[0]
+        return self.points.total - self.points.processes.largest(first)
+
+
+def _best(
+    chunk: SortedChunk,
+    nearest: Int[Tensor, "clusters count"],
+    columns: Float[Tensor, "clusters values rank"],
+) -> tuple[Float[Tensor, "slots"], Int[Tensor, "slots"]]:
+    """What each slot's point keeps at best in the columns of clusters near its own, and which."""
+    home = chunk.blocks.cluster_of_slot
+    best, labels = weights(chunk, columns).square().sum(1), home
+    better = 1.0 + _ROUNDING * torch.finfo(best.dtype).eps
+    for clusters in nearest.unbind(1)[1:]:
+        held = weights(chunk, columns[clusters]).square().sum(1)
+        moves = held > better * best
+        best = torch.where(moves, held, best)
+        labels = torch.where(moves, clusters[home], labels)
+    return best, labels

@@ -16,6 +16,7 @@ Source:
 from typing import Any, ClassVar, get_args
 
 import torch
+import torch.distributed as distributed
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -25,6 +26,7 @@ from prt_torch.representations.cpca_encoding import Encoding, Method, encode
 from prt_torch.representations.cpca_layout import VectorLayout
 from prt_torch.representations.cpca_search import Shape, random_encoding, search
 from prt_torch.representations.grouped import ClusterBlocks
+from prt_torch.representations.processes import Processes
 from prt_torch.representations.products import matmul_few
 from prt_torch.transfer import Surface, TransferTensor
 
@@ -57,13 +59,13 @@ class CPCA(Representation):
     def __init__(self, encoding: Encoding, surface: Surface, shape: tuple[int, int, int, int]):
         super().__init__(surface, shape)
         self.affine = encoding.affine
-        self.blocks = ClusterBlocks(encoding.labels, len(encoding.ranks))
-        self.layout = VectorLayout(encoding.labels, encoding.ranks, encoding.affine)
+        self._blocks: ClusterBlocks | None = None
+        self._layout: VectorLayout | None = None
         self._condition = encoding.condition
         self.representatives = nn.Parameter(
             encoding.representatives.unflatten(-1, shape[1:]).contiguous()
         )
-        self.weights = nn.Parameter(encoding.weights.clone())
+        self.weights = nn.Parameter(encoding.weights)
         self.register_buffer("labels", encoding.labels)
         self.register_buffer("ranks", encoding.ranks)
 
@@ -76,13 +78,16 @@ class CPCA(Representation):
         rank: int = 4,
         method: Method = "iterative",
         affine: bool = True,
+        memory_budget: int | None = None,
+        process_group: distributed.ProcessGroup | None = None,
         metric: Metric | None = None,
         generator: torch.Generator | None = None,
     ) -> "CPCA":
         """Cluster the points and fit each cluster's subspace.
 
         Args:
-            transfer: The tensor to stand for; read by blocks.
+            transfer: The tensor to stand for; read by blocks. With a ``process_group``, the points
+                of this process.
             num_clusters: At least 1; fewer are made if there are fewer distinct points.
             rank: Vectors a cluster beside its mean, at least 0 (vector quantisation). Limited to
                 the number of values of a point.
@@ -91,11 +96,22 @@ class CPCA(Representation):
                 from there with unequal ranks, within the bytes of equal ones.
             affine: Whether clusters have means. Without, subspaces go through the origin, and
                 the rank must be at least 1.
+            memory_budget: Bytes that all of this may take at its peak, the result included and what
+                was there before left out; as much as it takes if not given. Where it is short,
+                points are kept in a temporary file (``TMPDIR``) and read in chunks, which takes
+                longer and changes the result by rounding only. Tables for fast evaluation are made
+                at the first call, outside of it.
+            process_group: Processes that share the work, each with points of its own, in order of
+                rank; every process makes this call with the same options. The result has all
+                clusters and this process's points (:meth:`gathered` makes one of all), and the
+                clusters are those of one process with all points, to rounding.
             metric: What errors are worth; the L2 norm over light directions if not given.
             generator: Source of randomness; seed 0 if not given.
 
         Raises:
             ValueError: If ``num_clusters`` or ``rank`` is too small, or the method is unknown.
+            InputError: If ``memory_budget`` is less than the fit needs in any case: about what
+                labels and weights take, and six tables of all vectors.
 
         Source:
             Sloan et al. 2003, sections 4.1 (static), 4.2 (iterative), 4.3 (adaptive). We reassign
@@ -116,6 +132,8 @@ class CPCA(Representation):
             affine=affine,
             metric=metric or Metric.l2(transfer),
             generator=generator or torch.Generator().manual_seed(0),
+            memory_budget=memory_budget,
+            processes=Processes(process_group),
         )
         return cls(encoding, transfer.surface, tuple(transfer.values.shape))
 
@@ -174,6 +192,40 @@ class CPCA(Representation):
             metric=metric,
             generator=generator,
         )
+
+    def gathered(self, process_group: distributed.ProcessGroup | None) -> "CPCA":
+        """One model of all processes' points, on every process, from what each has fitted.
+
+        Args:
+            process_group: The one that :meth:`from_transfer` was given; points are in order of
+                rank.
+        """
+        processes = Processes(process_group)
+        labels = processes.gather(self.labels)
+        encoding = Encoding(
+            labels=labels,
+            ranks=self.ranks,
+            representatives=self.representatives.detach().flatten(1).clone(),
+            weights=processes.gather(self.weights.detach()),
+            affine=self.affine,
+            condition=self.condition,
+        )
+        surface = processes.gather_surface(self.surface, self.num_points)
+        return CPCA(encoding, surface, (len(labels), *self.shape[1:]))
+
+    @property
+    def blocks(self) -> ClusterBlocks:
+        """Points sorted by cluster; made where first needed, as it takes more than the weights."""
+        if self._blocks is None:
+            self._blocks = ClusterBlocks(self.labels, len(self.ranks))
+        return self._blocks
+
+    @property
+    def layout(self) -> VectorLayout:
+        """Places of vectors and weights; made where first needed."""
+        if self._layout is None:
+            self._layout = VectorLayout(self.labels, self.ranks, self.affine)
+        return self._layout
 
     @property
     def num_clusters(self) -> int:
@@ -309,7 +361,7 @@ class CPCA(Representation):
             labels=labels,
             ranks=ranks,
             representatives=representatives.flatten(1),
-            weights=weights.flatten(),
+            weights=weights.flatten().clone(),
             affine=means > 0,
             condition=float("nan"),
         )

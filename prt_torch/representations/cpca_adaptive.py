@@ -19,9 +19,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from prt_torch.representations.cpca_iteration import NEAREST, PrincipalAxes, Subspaces
+from prt_torch.representations.cpca_choice import Subspaces
+from prt_torch.representations.cpca_iteration import NEAREST, PrincipalAxes
 from prt_torch.representations.cpca_subspaces import Decomposition, decompose
-from prt_torch.representations.grouped import sort_labels
+from prt_torch.representations.points import Points, renumber
+from prt_torch.representations.steady import laid_out
 
 _LARGEST_RANK = 3  # times the mean rank
 _TURNS = 16
@@ -78,7 +80,7 @@ def share_out(
 
 
 def adapt(
-    data: Float[Tensor, "points d"],
+    points: Points,
     labels: Int[Tensor, "points"],
     num_clusters: int,
     rank: int,
@@ -88,7 +90,7 @@ def adapt(
     """Clusters and ranks from those of equal rank; never worse than these, nor larger.
 
     Args:
-        data: The points.
+        points: The points.
         labels: Clusters made for equal ranks.
         num_clusters: How many.
         rank: The equal rank, whose storage is the budget.
@@ -98,12 +100,12 @@ def adapt(
     Returns:
         The clusters' subspaces, and how many of their vectors to keep.
     """
-    largest = min(_LARGEST_RANK * rank, data.shape[1], len(data))
+    largest = min(_LARGEST_RANK * rank, points.rest[0], points.total)
     # Unequal ranks are stored too, in one byte or two a cluster.
     width = 1 if largest < 2**8 else 2
-    extra = -(-width * num_clusters // data.dtype.itemsize)
-    budget = rank * (len(data) + num_clusters * vector_numbers) - extra
-    equal = decompose(data, labels, num_clusters, max(largest, rank), affine)
+    extra = -(-width * num_clusters // points.like.element_size())
+    budget = rank * (points.total + num_clusters * vector_numbers) - extra
+    equal = decompose(points, labels, num_clusters, max(largest, rank), affine)
     ranks = torch.full_like(equal.sizes, rank)
     options = [(equal.error(ranks), equal, ranks)]
 
@@ -113,14 +115,14 @@ def adapt(
 
     if num_clusters > 1 and largest > 0:
         offer(equal)
-        moved = _move(data, equal, largest, affine, vector_numbers, budget)
-        offer(decompose(data, moved, num_clusters, largest, affine))
+        moved = _move(points, equal, largest, affine, vector_numbers, budget)
+        offer(decompose(points, moved, num_clusters, largest, affine))
     _, best, ranks = min(options, key=lambda option: option[0])
     return best, ranks
 
 
 def _move(
-    data: Float[Tensor, "points d"],
+    points: Points,
     start: Decomposition,
     largest: int,
     affine: bool,
@@ -128,25 +130,26 @@ def _move(
     budget: int,
 ) -> Int[Tensor, "points"]:
     """Turns of refitting, sharing out and moving points; the best labels seen."""
-    axes = PrincipalAxes(data)
+    axes = PrincipalAxes(points)
     shares = share_out(start.singular.square(), start.sizes, vector_numbers, budget)
     count = axes.enough(start.error(shares.ranks), least=largest)
-    points, labels = axes.leading(count), start.labels
-    vectors = (start.vectors[:, :largest].to(data) @ axes.axes[:, :count]).mT
+    some, labels = axes.leading(count), start.labels
+    vectors = axes.turned(start.vectors[:, :largest].to(points.like), count).mT
     num_clusters, best, best_labels, idle = len(vectors), torch.inf, labels, 0
     for _ in range(_TURNS):
-        labels, old = sort_labels(labels, num_clusters)
-        fit = Subspaces(points, labels, vectors[old], affine, steps=1)
+        labels, old = renumber(labels, num_clusters, points.processes)
+        fit = Subspaces(some, labels, vectors[old], affine, steps=1)
         squares = fit.squares()
         vectors = fit.vectors
-        shares = share_out(squares, fit.blocks.sizes(), vector_numbers, budget)
+        shares = share_out(squares, fit.sizes, vector_numbers, budget)
         used = torch.arange(largest, device=labels.device) < shares.ranks[:, None]
-        error = float(fit.spread().double().sum() - (squares * used).sum())
+        error = float(fit.spread().sum() - (squares * used).sum())
         idle = 0 if error < (1.0 - _GAIN) * best else idle + 1
         if error < best:
             best, best_labels = error, labels
         if idle == _PATIENCE:
             break
-        fit.vectors = (vectors * used[:, None].to(data))[:, :, : int(shares.ranks.max())]
-        labels, _ = fit.reassign(NEAREST, price=(shares.price * shares.ranks).to(data))
+        kept = (vectors * used[:, None].to(vectors))[:, :, : int(shares.ranks.max())]
+        fit.vectors = laid_out(kept)
+        labels, _ = fit.reassign(NEAREST, price=(shares.price * shares.ranks).to(vectors))
     return best_labels

@@ -1,8 +1,9 @@
 """How CPCA finds its clusters and subspaces.
 
-1. Transfer is weighed by the metric, so that errors are plain sums of squares. Where a point has
-   more values than ``_MAX_DIMENSIONS``, one near-lossless projection (randomised, by blocks of
-   points) makes every later step cheap.
+1. Transfer of extreme magnitude is scaled (``magnitude``), and weighed by the metric, so that
+   errors are plain sums of squares. Where a point has
+   more values than ``MAX_DIMENSIONS``, one near-lossless projection (``cpca_projection``) makes
+   every later step cheap.
 2. Lloyd's iterations give the first clusters (``cpca_clusters``): from k-means++ seeds and to their
    end where they are the clusters (static), from cheaper seeds and only roughly where they are a
    start (iterative), which ends as low in half the time.
@@ -11,10 +12,14 @@
 5. The last subspaces come from a full decomposition of each cluster in float64
    (``cpca_subspaces``).
 
+Points are read in chunks where a budget of memory asks for it, and may lie in several processes
+(``points``).
+
 Source:
     Sloan, Hall, Hart, Snyder 2003, section 4.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -27,12 +32,28 @@ from prt_torch.metric import Metric
 from prt_torch.representations.cpca_adaptive import adapt
 from prt_torch.representations.cpca_clusters import vector_quantise
 from prt_torch.representations.cpca_iteration import iterate
+from prt_torch.representations.cpca_projection import Projected, project, weighed_blocks
 from prt_torch.representations.cpca_subspaces import Decomposition, decompose
+from prt_torch.representations.magnitude import of_ordinary_magnitude
+from prt_torch.representations.points import (
+    Mapped,
+    Points,
+    SortedPoints,
+    cluster_sizes,
+    label_type,
+    slices,
+)
+from prt_torch.representations.processes import ALONE, Processes
+from prt_torch.representations.scratch import Memory
 from prt_torch.transfer import TransferTensor
 
 Method = Literal["iterative", "static", "adaptive"]
 
-_MAX_DIMENSIONS = 256  # of the projection; 3 further ranks than it loses less than 1e-3 of energy
+MAX_DIMENSIONS = 256
+"""Of the projection; 3 further ranks than it loses less than 1e-3 of energy."""
+
+_LABELS = 8  # of a point, of several kinds, while clusters are looked for
+_TABLES = 6  # of the size of all vectors, float64
 
 
 @dataclass(frozen=True)
@@ -65,92 +86,133 @@ def encode(
     affine: bool,
     metric: Metric,
     generator: torch.Generator,
+    memory_budget: int | None = None,
+    processes: Processes = ALONE,
 ) -> Encoding:
-    """Cluster the points of a transfer tensor and fit each cluster's subspace."""
+    """Cluster the points of a transfer tensor and fit each cluster's subspace.
+
+    Raises:
+        InputError: If ``memory_budget`` is too small.
+    """
     size = transfer.num_channels * transfer.num_rows * transfer.num_coeffs
     rank = min(rank, size)
-    data, lift = project(transfer, metric, rank, generator)
-    data_mean = data.mean(0, dtype=torch.float64).to(data) * affine
-    data = data - data_mean
+    dimensions = max(MAX_DIMENSIONS, 3 * rank)
+    memory = _memory(transfer, num_clusters, rank, min(size, dimensions), memory_budget)
+    transfer, power = of_ordinary_magnitude(transfer, memory, processes)
+    projected = project(transfer, metric, dimensions, generator, memory, processes)
+    points = projected.points
+    data_mean = _centre(points) if affine else points.like.new_zeros(points.rest)
     rough = method != "static" and rank > 0
-    labels, num_clusters = vector_quantise(data, num_clusters, generator, rough)
+    labels, num_clusters = vector_quantise(points, num_clusters, generator, rough)
     if rough and num_clusters > 1:
-        labels = iterate(data, labels, num_clusters, rank, affine, generator)
+        labels = iterate(points, labels, num_clusters, rank, affine, generator)
     if method == "adaptive":
-        found, ranks = adapt(data, labels, num_clusters, rank, affine, size)
+        found, ranks = adapt(points, labels, num_clusters, rank, affine, size)
     else:
-        found = decompose(data, labels, num_clusters, rank, affine)
+        found = decompose(points, labels, num_clusters, rank, affine)
         ranks = torch.full_like(found.sizes, rank)
-    vectors = found.vectors[found.used(ranks)]
-    means = found.means + data_mean.to(found.means)
-    if lift is not None:
-        vectors = vectors @ lift.mT.to(vectors)
-        if affine:
-            means = _exact_means(transfer, metric, found.labels, num_clusters)
-    return _pack(transfer, metric, found, ranks, means if affine else None, vectors)
-
-
-def _pack(
-    transfer: TransferTensor,
-    metric: Metric,
-    found: Decomposition,
-    ranks: Int[Tensor, "clusters"],
-    means: Float[Tensor, "clusters values"] | None,
-    vectors: Float[Tensor, "vectors values"],
-) -> Encoding:
-    """Means before their clusters' vectors, out of the metric, in the transfer's precision."""
-    together = vectors
-    if means is not None:
-        together = vectors.new_empty(len(means) + len(vectors), vectors.shape[1])
-        is_mean = torch.zeros(len(together), dtype=torch.bool, device=vectors.device)
-        is_mean[(ranks + 1).cumsum(0) - ranks - 1] = True
-        together[is_mean], together[~is_mean] = means, vectors
-    shaped = together.unflatten(-1, tuple(transfer.values.shape[1:]))
-    dtype = transfer.values.dtype
+    del labels
+    representatives = _representatives(
+        transfer, metric, projected, found, ranks, data_mean if affine else None
+    )
+    if affine:
+        representatives[(ranks + 1).cumsum(0) - ranks - 1] /= power
     return Encoding(
-        labels=found.labels,
+        representatives=representatives,
+        weights=_weights(points, found, ranks).div_(power),
+        labels=found.labels.long(),
         ranks=ranks,
-        representatives=metric.unweigh(shaped).flatten(1).to(dtype),
-        weights=found.weights[found.used(ranks)[found.labels]].to(dtype),
-        affine=means is not None,
+        affine=affine,
         condition=found.condition(ranks),
     )
 
 
-def weighed_blocks(
-    transfer: TransferTensor, metric: Metric
-) -> Iterator[tuple[slice, Float[Tensor, "points values"]]]:
-    """Blocks of points where errors are sums of squares."""
-    for rows, values in transfer.blocks():
-        yield rows, metric.weigh(values).flatten(1)
-
-
-def project(
-    transfer: TransferTensor, metric: Metric, rank: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "points d"], Float[Tensor, "values d"] | None]:
-    """Points in the space that clustering works in; the orthonormal way back if they were cut."""
+def _memory(
+    transfer: TransferTensor, num_clusters: int, rank: int, dimensions: int, budget: int | None
+) -> Memory:
+    """The budget, less what labels, weights and tables of all clusters take at their most."""
+    itemsize = transfer.values.dtype.itemsize
     size = transfer.num_channels * transfer.num_rows * transfer.num_coeffs
-    dimensions = max(_MAX_DIMENSIONS, 3 * rank)
-    if size <= dimensions:
-        data = torch.cat([values for _, values in weighed_blocks(transfer, metric)])
-        return data, None
-    lift = torch.randn(size, dimensions, generator=generator).to(transfer.values[0:1])
-    for _ in range(3):  # orthogonal iteration on the second moment, by blocks of points
-        image = torch.zeros_like(lift, dtype=torch.float64)
-        for _, values in weighed_blocks(transfer, metric):
-            image += values.mT @ (values @ lift)
-        lift = torch.linalg.qr(image)[0].to(lift)
-    data = torch.cat([values @ lift for _, values in weighed_blocks(transfer, metric)])
-    return data, lift
+    vectors = num_clusters * (rank + 1)
+    labels = _LABELS * label_type(num_clusters).itemsize
+    working = transfer.num_points * (labels + itemsize)
+    result = transfer.num_points * (rank * itemsize + 8) + vectors * size * itemsize
+    tables = vectors * dimensions * 8 * _TABLES
+    return Memory(budget, max(working, result) + tables)
+
+
+def _centre(points: Points) -> Float[Tensor, "d"]:
+    """Take the mean off all points."""
+    total = points.like.new_zeros(points.rest, dtype=torch.float64)
+    for _, values in points.chunks():
+        total += values.sum(0, dtype=torch.float64)
+    mean = (points.processes.sum(total) / points.total).to(points.like)
+    for rows, values in points.chunks():
+        points.write(rows, values - mean)
+    return mean
+
+
+def _representatives(
+    transfer: TransferTensor,
+    metric: Metric,
+    projected: Projected,
+    found: Decomposition,
+    ranks: Int[Tensor, "clusters"],
+    data_mean: Float[Tensor, "d"] | None,
+) -> Float[Tensor, "vectors values"]:
+    """Means before their clusters' vectors, out of the metric, in the transfer's precision."""
+    points, affine = projected.points, int(data_mean is not None)
+    shape = tuple(transfer.values.shape[1:])
+    first = (ranks + affine).cumsum(0) - ranks - affine
+    out = points.like.new_empty(int((ranks + affine).sum()), math.prod(shape))
+
+    def write(places: Tensor, weighed: Float[Tensor, "some values"]) -> None:
+        out[places] = metric.unweigh(weighed.unflatten(-1, shape)).flatten(1).to(out)
+
+    if data_mean is not None and projected.lift is None:
+        write(first, found.means + data_mean.to(found.means))
+    elif data_mean is not None:
+        for clusters, means in _exact_means(transfer, metric, found, points):
+            write(first[clusters], means)
+    used = found.used(ranks)
+    steps = torch.arange(used.shape[1], device=used.device) + affine
+    places, vectors = (first[:, None] + steps)[used], found.vectors[used]
+    at_once = points.memory.rows_at_once(8 * len(out[0])) or max(1, len(places))
+    for some in slices(len(places), at_once):
+        write(places[some], projected.lifted(vectors[some]))
+    return out
+
+
+def _weights(
+    points: Points, found: Decomposition, ranks: Int[Tensor, "clusters"]
+) -> Float[Tensor, "entries"]:
+    """One point after the other, in its own cluster's vectors."""
+    used = found.used(ranks)
+    own = cluster_sizes(found.labels, len(ranks))
+    entries = points.like.new_empty(int((own * ranks).sum()))
+    exact = points.with_rows(Mapped(points.rows, Tensor.double, *points.rest))
+    centred = SortedPoints(exact, found.labels, len(ranks))
+    centred.centre(found.means)
+    at = 0
+    for chunk in centred:
+        blocks = chunk.blocks
+        weights = blocks.to_points(blocks.matmul(chunk.slots, found.vectors.mT))
+        kept = weights[used[found.labels[chunk.rows].long()]]
+        entries[at : at + len(kept)] = kept.to(entries)
+        at += len(kept)
+    return entries
 
 
 def _exact_means(
-    transfer: TransferTensor, metric: Metric, labels: Tensor, num_clusters: int
-) -> Float[Tensor, "clusters values"]:
-    """Cluster means of the unprojected values, float64."""
+    transfer: TransferTensor, metric: Metric, found: Decomposition, points: Points
+) -> Iterator[tuple[slice, Float[Tensor, "clusters values"]]]:
+    """Cluster means of the unprojected values, float64, of as many clusters as fit at a time."""
     size = transfer.num_channels * transfer.num_rows * transfer.num_coeffs
-    total = torch.zeros(num_clusters, size, dtype=torch.float64, device=labels.device)
-    for rows, values in weighed_blocks(transfer, metric):
-        total.index_add_(0, labels[rows], values.double())
-    count = torch.bincount(labels, minlength=num_clusters).clamp_min(1)
-    return total / count[:, None]
+    at_once = points.memory.rows_at_once(8 * size) or len(found.sizes)
+    for clusters in slices(len(found.sizes), at_once):
+        total = found.means.new_zeros(clusters.stop - clusters.start, size)
+        for rows, values in weighed_blocks(transfer, metric, points.memory):
+            labels = found.labels[rows].long() - clusters.start
+            own = torch.nonzero((labels >= 0) & (labels < len(total)))[:, 0]
+            total.index_add_(0, labels[own], values[own].double())
+        yield clusters, points.processes.sum(total) / found.sizes[clusters, None].clamp_min(1)

@@ -22,7 +22,8 @@ from prt_torch.errors import InputError
 from prt_torch.metric import Metric
 from prt_torch.representations.base import Representation
 from prt_torch.representations.cpca_clusters import count_distinct, vector_quantise
-from prt_torch.representations.cpca_encoding import Encoding, project, weighed_blocks
+from prt_torch.representations.cpca_encoding import MAX_DIMENSIONS, Encoding
+from prt_torch.representations.cpca_projection import project, weighed_blocks
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.transfer import TransferTensor
@@ -124,7 +125,7 @@ def error_table(
 
     Clusters are those of distance alone, so iterative encodings lose less.
     """
-    data, _ = project(transfer, metric, 0, generator)
+    data = project(transfer, metric, MAX_DIMENSIONS, generator).points.dense()
     norm = sum(float(v.double().square().sum()) for _, v in weighed_blocks(transfer, metric))
     lost = max(0.0, norm - float(data.double().square().sum()))  # beyond the projection
     if lost < 1e-6 * norm:

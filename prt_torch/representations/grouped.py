@@ -8,6 +8,7 @@ gather, which drops the padding and undoes the sorting at once.
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -15,12 +16,13 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 _BUCKET_COST = 1500  # slots of padding that are worth one batched product less
+_RUN_ELEMENTS = 2**18
 _CUTS = 48  # places considered for the border between two buckets
 
 
 @dataclass(frozen=True)
 class Bucket:
-    """A run of clusters that are padded to the same number of slots."""
+    """A run of clusters, by falling size, that are padded to the same number of slots."""
 
     first_cluster: int
     num_clusters: int
@@ -29,7 +31,7 @@ class Bucket:
 
     @property
     def clusters(self) -> slice:
-        """Its clusters."""
+        """Its clusters, counted from the largest to the smallest."""
         return slice(self.first_cluster, self.first_cluster + self.num_clusters)
 
     @property
@@ -57,26 +59,33 @@ class ClusterBlocks(nn.Module):
     """Where each point's slot is, and products of slots with per-cluster matrices.
 
     Args:
-        labels: Cluster of each point; clusters numbered from the largest to the smallest
-            (:func:`sort_labels`).
-        num_clusters: How many clusters there are; the last ones may be empty.
+        labels: Cluster of each point. Where clusters are numbered from the largest to the smallest
+            (:func:`sort_labels`), no matrix is ever copied.
+        num_clusters: How many clusters there are; some may be empty.
+        slots_by: Clusters have a multiple of this many slots.
 
     Raises:
-        ValueError: If labels are out of range or clusters are not sorted by size.
+        ValueError: If labels are out of range.
     """
 
     slot_of_point: Tensor
     point_of_slot: Tensor
     cluster_of_slot: Tensor
     filled: Tensor
+    _by_size: Tensor | None
 
-    def __init__(self, labels: Int[Tensor, "points"], num_clusters: int):
+    def __init__(self, labels: Int[Tensor, "points"], num_clusters: int, *, slots_by: int = 1):
         super().__init__()
         sizes = torch.bincount(labels, minlength=num_clusters)
-        if len(sizes) != num_clusters or bool((sizes.diff() > 0).any()):
-            raise ValueError("expected clusters numbered from the largest to the smallest")
+        if len(sizes) != num_clusters:
+            raise ValueError(f"expected labels below {num_clusters}, got {len(sizes) - 1}")
         self.num_points, self.num_clusters = len(labels), num_clusters
-        self.buckets = _buckets(sizes.tolist())
+        by_size: Tensor | None = None
+        if bool((sizes.diff() > 0).any()):
+            labels, by_size = sort_labels(labels, num_clusters)
+            sizes = sizes[by_size]
+        self.register_buffer("_by_size", by_size, persistent=False)
+        self.buckets = _buckets(sizes.tolist(), slots_by)
         self.num_slots = sum(b.num_clusters * b.size for b in self.buckets)
         first_slot = torch.empty(num_clusters, dtype=torch.int64)
         width = torch.empty(num_clusters, dtype=torch.int64)
@@ -94,7 +103,8 @@ class ClusterBlocks(nn.Module):
         point_of_slot[slots] = by_cluster
         filled = torch.zeros(self.num_slots, dtype=torch.bool, device=labels.device)
         filled[slots] = True
-        cluster_of_slot = torch.repeat_interleave(torch.arange(num_clusters), width)
+        own = torch.arange(num_clusters) if by_size is None else by_size.cpu()
+        cluster_of_slot = torch.repeat_interleave(own, width)
         self.register_buffer("slot_of_point", slot_of_point, persistent=False)
         self.register_buffer("point_of_slot", point_of_slot, persistent=False)
         self.register_buffer("filled", filled, persistent=False)
@@ -109,12 +119,50 @@ class ClusterBlocks(nn.Module):
         """Back to the order of the points, without the padding."""
         return values.index_select(0, self.slot_of_point)
 
+    @property
+    def padding(self) -> Int[Tensor, "some"]:
+        """Slots without a point."""
+        return torch.nonzero(~self.filled)[:, 0]
+
     def by_bucket(self, values: Float[Tensor, "slots *rest a"]) -> list[Tensor]:
         """Views ``"clusters rows a"``, one a bucket; rows are slots times ``rest``."""
         per_slot, width = math.prod(values.shape[1:-1]), values.shape[-1]
         return [
             values[b.slots].reshape(b.num_clusters, b.size * per_slot, width) for b in self.buckets
         ]
+
+    def runs(
+        self, *values: Shaped[Tensor, "slots *rest"], most: int = _RUN_ELEMENTS
+    ) -> Iterator[tuple[slice, list[Tensor]]]:
+        """A few clusters at a time, with views ``"some size *rest"`` of their slots.
+
+        What is made of them is small enough to stay in cache. Clusters are counted from the largest
+        to the smallest: :meth:`by_size` and :meth:`by_number` say which these are.
+
+        Args:
+            values: Of the slots.
+            most: Elements of a view, if more than one cluster is in it.
+        """
+        width = max(1, *(math.prod(one.shape[1:]) for one in values))
+        for bucket in self.buckets:
+            views = [
+                one[bucket.slots].unflatten(0, (bucket.num_clusters, bucket.size)) for one in values
+            ]
+            count = max(1, most // (bucket.size * width))
+            for first in range(0, bucket.num_clusters, count):
+                last = min(first + count, bucket.num_clusters)
+                some = slice(bucket.first_cluster + first, bucket.first_cluster + last)
+                yield some, [view[first:last] for view in views]
+
+    def by_size(self, values: Shaped[Tensor, "clusters *rest"]) -> Tensor:
+        """Values of the clusters from the largest to the smallest."""
+        return values if self._by_size is None else values[self._by_size]
+
+    def by_number(self, values: Shaped[Tensor, "clusters *rest"]) -> Tensor:
+        """The inverse of :meth:`by_size`."""
+        if self._by_size is None:
+            return values
+        return torch.empty_like(values).index_copy_(0, self._by_size, values)
 
     def matmul(
         self,
@@ -123,6 +171,8 @@ class ClusterBlocks(nn.Module):
         offsets: Float[Tensor, "clusters b"] | None = None,
     ) -> Float[Tensor, "slots *rest b"]:
         """Each slot's rows times its own cluster's matrix, plus its cluster's offset."""
+        matrices = self.by_size(matrices)
+        offsets = None if offsets is None else self.by_size(offsets)
         products = [
             torch.bmm(rows, matrices[bucket.clusters])
             if offsets is None
@@ -138,28 +188,30 @@ class ClusterBlocks(nn.Module):
     ) -> Float[Tensor, "clusters a b"]:
         """Sum over each cluster's slots of the outer products of its rows."""
         pairs = zip(self.by_bucket(left), self.by_bucket(right), strict=True)
-        return torch.cat([torch.bmm(a.mT, b) for a, b in pairs])
+        return self.by_number(torch.cat([torch.bmm(a.mT, b) for a, b in pairs]))
 
     def sum(self, slots: Float[Tensor, "slots a"]) -> Float[Tensor, "clusters a"]:
         """Sum over each cluster's slots, in float64."""
-        return torch.cat([rows.sum(1, dtype=torch.float64) for rows in self.by_bucket(slots)])
+        sums = [rows.double().sum(1) for _, (rows,) in self.runs(slots)]  # 3x faster than dtype=
+        return self.by_number(torch.cat(sums))
 
     def sizes(self) -> Int[Tensor, "clusters"]:
         """Points a cluster."""
         return torch.bincount(self.cluster_of_slot[self.slot_of_point], minlength=self.num_clusters)
 
 
-def _buckets(sizes: list[int]) -> list[Bucket]:
+def _buckets(sizes: list[int], slots_by: int) -> list[Bucket]:
     """Cut clusters, sorted by falling size, into buckets of least padding plus bucket cost."""
+    sizes = [max(1, -(-size // slots_by)) * slots_by for size in sizes]
     count = len(sizes)
-    cuts = sorted({round(i * count / min(count, _CUTS)) for i in range(min(count, _CUTS) + 1)})
+    steps = [place for place in range(1, count) if sizes[place] < sizes[place - 1]]
+    some = min(len(steps), _CUTS)
+    cuts = [0, *(steps[place * len(steps) // some] for place in range(some)), count]
     best: list[tuple[int, int]] = [(0, 0)]  # cost of the clusters before a cut, cut before it
     for end in range(1, len(cuts)):
         options = [
             (
-                best[start][0]
-                + max(sizes[cuts[start]], 1) * (cuts[end] - cuts[start])
-                + _BUCKET_COST,
+                best[start][0] + sizes[cuts[start]] * (cuts[end] - cuts[start]) + _BUCKET_COST,
                 start,
             )
             for start in range(end)
@@ -172,6 +224,6 @@ def _buckets(sizes: list[int]) -> list[Bucket]:
     buckets, slot = [], 0
     for start, end in itertools.pairwise(borders):
         first, clusters = cuts[start], cuts[end] - cuts[start]
-        buckets.append(Bucket(first, clusters, max(sizes[first], 1), slot))
+        buckets.append(Bucket(first, clusters, sizes[first], slot))
         slot += clusters * buckets[-1].size
     return buckets

@@ -34,7 +34,6 @@ from prt_torch.bases.srbf_objective import (
 from prt_torch.errors import InputError
 from prt_torch.metric import Metric
 from prt_torch.representations.clustered_tensor_projection import (
-    Projection,
     project,
     read_moments,
 )
@@ -93,8 +92,11 @@ def encode(
         least=(1, min(_SUBSPACE, transfer.num_coeffs)),
         memory_budget=memory_budget,
     )
-    labels, made = vector_quantise(found.points.flatten(1), num_clusters, generator, rough=False)
-    fitting = _Fitting(found, metric, basis, resolution, clusters_at_once, memory_budget)
+    points = found.points.dense()
+    labels, made = vector_quantise(points.flatten(1), num_clusters, generator, rough=False)
+    fitting = _Fitting(
+        points, found.light_axes, metric, basis, resolution, clusters_at_once, memory_budget
+    )
     # Threads that wait for one another cost more than a small fit.
     small = 6 * resolution**2 * num_functions < _SMALL
     with one_thread() if small else nullcontext():
@@ -169,7 +171,8 @@ class _Functions:
 class _Fitting:
     """What fits of functions to points in their axes need."""
 
-    found: Projection
+    points: Float[Tensor, "points view light"]
+    light_axes: Float[Tensor, "coeffs light"]
     metric: Metric
     basis: LightBasis
     resolution: int
@@ -197,10 +200,10 @@ class _Fitting:
         """Functions of direction that span most of each cluster's transfer, by their size."""
         vectors = []
         for cluster in range(num_clusters):
-            rows = self.found.points[labels == cluster].flatten(0, 1).double()
+            rows = self.points[labels == cluster].flatten(0, 1).double()
             singular, directions = principal(rows[None], min(_SUBSPACE, rows.shape[1]))
             vectors.append(singular[0, :, None] * directions[0])
-        weighed = torch.stack(vectors) @ self.found.light_axes.mT
+        weighed = torch.stack(vectors) @ self.light_axes.mT
         values = _of_light(self.metric).unweigh(weighed).flatten(0, 1)
         at_texels = _at_texels(values, self.basis, self.resolution, self.memory_budget)
         return at_texels.unflatten(0, weighed.shape[:2]).mT
@@ -213,12 +216,12 @@ class _Fitting:
         expanded = in_light_basis(self.basis, centers, log_bandwidths, self.resolution)
         with one_thread():
             spans = torch.linalg.qr(_of_light(self.metric).weigh(expanded).mT)[0]
-        spans = (self.found.light_axes.mT @ spans).to(self.found.points)
+        spans = (self.light_axes.mT @ spans).to(self.points)
         held = torch.zeros(near.shape, dtype=torch.float64, device=near.device)
         for cluster, span in enumerate(spans):
             points, places = torch.nonzero(near == cluster, as_tuple=True)
             for some, own in zip(points.split(_POINTS), places.split(_POINTS), strict=True):
-                products = self.found.points[some] @ span
+                products = self.points[some] @ span
                 held[some, own] = products.square().sum((1, 2), dtype=torch.float64)
         return held
 
@@ -227,7 +230,7 @@ def _fitted(
     fitting: _Fitting, labels: Int[Tensor, "points"], num_clusters: int, num_functions: int
 ) -> tuple[Int[Tensor, "points"], _Functions]:
     """Fits and moves of points in turn; the clusters and functions of least error."""
-    points = fitting.found.points.flatten(1)
+    points = fitting.points.flatten(1)
     functions = fitting.fit(labels, num_clusters, num_functions)
     best, least = (labels, functions), math.inf
     norm = float(torch.linalg.vector_norm(points, dtype=torch.float64).square())
