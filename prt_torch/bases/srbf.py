@@ -47,6 +47,7 @@ from prt_torch.sphere import cubemap_directions, cubemap_solid_angles
 
 __all__ = [
     "SRBF",
+    "WORST_CONDITION",
     "Fit",
     "KernelName",
     "SRBFExpansion",
@@ -62,9 +63,11 @@ __all__ = [
     "icosahedral_centers",
 ]
 
+WORST_CONDITION = 1e8
+"""Of a Gram matrix as it is used; its Cholesky factor then has 1e4, bearable in float32."""
+
 _PAPER_DEVIATION = math.pi / 40  # rad, with the 642 centres of 3 subdivisions
 _PAPER_SUBDIVISIONS = 3
-_WORST_CONDITION = 1e8  # of a Gram matrix; its Cholesky factor then has 1e4, bearable in float32
 _TABLE_ELEMENTS = 2**18  # of kernel values at once: they stay in a processor's cache
 _SUBSAMPLES = 4  # along a texel's edge, as the paper supersamples
 
@@ -112,7 +115,7 @@ def _extremes(matrix: Float[Tensor, "n n"]) -> Float[Tensor, "2"]:
 def _bounded(matrix: Float[Tensor, "n n"], extremes: Float[Tensor, "2"]) -> Float[Tensor, "n n"]:
     """A symmetric matrix with as much of the identity as bounds its condition."""
     smallest, largest = extremes.unbind()
-    ridge = ((largest - _WORST_CONDITION * smallest) / (_WORST_CONDITION - 1.0)).clamp_min(0.0)
+    ridge = ((largest - WORST_CONDITION * smallest) / (WORST_CONDITION - 1.0)).clamp_min(0.0)
     return matrix + ridge * torch.eye(len(matrix), dtype=matrix.dtype)
 
 
