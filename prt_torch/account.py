@@ -1,6 +1,6 @@
 """A run's account of itself: errors, bytes, times, pictures and what was left out."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,11 @@ from prt_torch.representations import (
     CPCA,
     ClusteredTensor,
     DenseTransfer,
-    Representation,
     SegmentedCPCA,
 )
 from prt_torch.representations.cpca_relabel import coherence
 from prt_torch.settings import PreviewConfig
+from prt_torch.solves import Fitted, Solve
 from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
@@ -32,23 +32,14 @@ _VIEWS = 6  # around the scene, that errors of glossy transfer are averaged over
 _DENSE_BLOCK_POINTS = 2000  # timed and scaled up when the whole tensor does not fit
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """One result: a representation and how it came about."""
-
-    name: str
-    representation: Representation
-    status: str
-    seconds: float
-    condition: float
-
-
+@torch.no_grad()
 def write_report(
     out: Path,
     inputs: Inputs,
     transfer: TransferTensor,
     fitted: list[Fitted],
     *,
+    solved: list[Solve],
     preview: PreviewConfig,
     memory_budget: int,
 ) -> dict[str, Any]:
@@ -83,6 +74,7 @@ def write_report(
     report = _facts(inputs, transfer)
     report["left_out"] = _left_out(inputs, transfer, opengl_missing=not opengl_drew)
     report["left_out"] += _left_out_segments(transfer, fitted)
+    report["solves"] = [solve.entry() for solve in solved]
     report["results"] = []
     for one in fitted:
         lost = float(errors[one.name].sum())

@@ -18,10 +18,18 @@ from torch import Tensor
 from prt_torch import store
 from prt_torch.errors import InputError
 from prt_torch.metric import Metric
-from prt_torch.representations import Representation
+from prt_torch.representations import Representation, undetermined
 from prt_torch.transfer import TransferTensor
 
-Status = Literal["closed_form", "converged", "max_steps", "stagnated", "nonfinite", "interrupted"]
+Status = Literal[
+    "closed_form",
+    "rank_deficient",
+    "converged",
+    "max_steps",
+    "stagnated",
+    "nonfinite",
+    "interrupted",
+]
 
 _BLOCK_BYTES = 2**26
 _PATIENCE = 5  # steps without a better state before a fit counts as stagnated
@@ -35,8 +43,8 @@ class FitResult:
         representation: The one that was given, at its best state.
         status: ``converged`` (steps gain less than the tolerance), ``max_steps``, ``stagnated``
             (several steps in a row found nothing better), ``nonfinite`` (the loss became NaN or
-            infinite and the best state before was kept), ``interrupted``, or ``closed_form``
-            (no steps were asked for).
+            infinite and the best state before was kept), ``interrupted``, or, where no steps were
+            asked for, ``closed_form`` or ``rank_deficient`` (:func:`construction_status`).
         error_before: Squared error over squared norm in the metric, as given.
         error_after: The same at the end; never larger.
         steps: Steps taken, those before a resumption included.
@@ -110,7 +118,9 @@ def fit(
     except KeyboardInterrupt:
         interrupted = True
     run.restore_best()
-    status: Status = run.ended or ("max_steps" if max_steps else "closed_form")
+    status: Status = run.ended or (
+        "max_steps" if max_steps else construction_status(representation)
+    )
     return FitResult(
         representation=representation,
         status="interrupted" if interrupted else status,
@@ -121,6 +131,14 @@ def fit(
         condition=representation.condition,
         history=run.history[1:],
     )
+
+
+def construction_status(representation: Representation) -> Status:
+    """``closed_form``, or ``rank_deficient`` where its data leave directions undetermined.
+
+    Nothing is lost by those; they take bytes for nothing.
+    """
+    return "rank_deficient" if undetermined(representation) else "closed_form"
 
 
 class _Run:

@@ -17,16 +17,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from prt_torch import store
-from prt_torch.account import PICTURES, Fitted, write_report
+from prt_torch.account import PICTURES, write_report
 from prt_torch.assets import Mesh
 from prt_torch.baking import RESOLVED, bake
 from prt_torch.errors import InputError
-from prt_torch.fitting import fit
+from prt_torch.fitting import construction_status, fit
 from prt_torch.gallery import file_name
 from prt_torch.inputs import Inputs, load_inputs
 from prt_torch.inspection import leave_out
 from prt_torch.metric import Metric
-from prt_torch.report import summary_table
+from prt_torch.report import solves_table, summary_table
 from prt_torch.representations import (
     CPCA,
     Representation,
@@ -45,6 +45,7 @@ from prt_torch.settings import (
     SegmentedCPCAConfig,
     WaveletConfig,
 )
+from prt_torch.solves import Fitted, solves
 from prt_torch.transfer import TransferTensor
 
 CONFIG, RESULTS = "config.yaml", "results"
@@ -71,18 +72,24 @@ def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]
         if transfer.surface.light_basis is not None:  # lights are projected to what transfer has
             inputs = replace(inputs, light_basis=transfer.surface.light_basis)
         store.write_bytes(out / CONFIG, _claim(config, inputs).encode())
-        fitted = _fit_all(out, config, inputs, transfer, console)
+        metric = _metric(config, inputs, transfer)
+        fitted = _fit_all(out, config, inputs, transfer, metric, console)
+        solved = solves(transfer, metric, fitted)
         console.print("evaluating and drawing ...")
         report = write_report(
             out,
             inputs,
             transfer,
             fitted,
+            solved=solved,
             preview=config.preview,
             memory_budget=config.memory_budget,
         )
         _write_manifest(out, transfer)
     console.print(summary_table(report))
+    console.print(solves_table(report))
+    for warning in filter(None, (solve.warning for solve in solved)):
+        console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
     return report
 
@@ -205,14 +212,23 @@ def _progress(console: Console) -> Progress:
     )
 
 
+def _metric(config: RunConfig, inputs: Inputs, transfer: TransferTensor) -> Metric:
+    """What errors are worth."""
+    if config.fit.metric == "l2":
+        return Metric.l2(transfer)
+    lights = torch.stack([inputs.light_basis.project(light) for light in inputs.fit_lights])
+    exit_basis = transfer.surface.exit_basis
+    return Metric.light_prior(lights, inputs.light_basis, exit_basis=exit_basis)
+
+
 def _fit_all(
-    out: Path, config: RunConfig, inputs: Inputs, transfer: TransferTensor, console: Console
+    out: Path,
+    config: RunConfig,
+    inputs: Inputs,
+    transfer: TransferTensor,
+    metric: Metric,
+    console: Console,
 ) -> list[Fitted]:
-    metric = Metric.l2(transfer)
-    if config.fit.metric == "light_prior":
-        lights = torch.stack([inputs.light_basis.project(light) for light in inputs.fit_lights])
-        exit_basis = transfer.surface.exit_basis
-        metric = Metric.light_prior(lights, inputs.light_basis, exit_basis=exit_basis)
     fitted = []
     with _progress(console) as progress:
         for wanted in config.fitted:
@@ -296,6 +312,7 @@ def _fit_one(
         return Fitted(name, model, **store.read_json(record))
     start = time.perf_counter()
     representation = _closed_form(wanted, config, inputs, transfer, metric)
+    construction = construction_status(representation)
     result = fit(
         representation,
         transfer,
@@ -309,6 +326,7 @@ def _fit_one(
         "status": result.status,
         "seconds": time.perf_counter() - start,
         "condition": result.condition,
+        "construction": construction,
     }
     if result.status == "interrupted":
         raise KeyboardInterrupt  # the checkpoint stays; starting again goes on from it

@@ -357,8 +357,9 @@ def test_limits_are_finite(model, dtype):
     values = model.evaluate(wi, wo)
     assert values.isfinite().all()
     assert (values >= 0).all()
-    hidden = (wi[:, 2] <= 0) | (wo[:, 2] <= 0)
+    hidden = (wi[:, 2] < 0) | (wo[:, 2] < 0)
     assert (values[hidden] == 0).all()
+    assert torch.allclose(values[:2], values[2:4])  # the horizon is the limit from above
     for gradient in torch.autograd.grad(values.sum(), (wi, wo)):
         assert gradient.isfinite().all()
         assert (gradient[hidden] == 0).all()

@@ -306,7 +306,8 @@ def finished(tmp_path_factory) -> Path:
 class TestWholeRun:
     def test_report_has_the_keys_of_the_design(self, finished):
         report = json.loads((finished / "out/report.json").read_text())
-        assert set(report) == {"scene", "light", "bake", "raw_bytes", "left_out", "results"}
+        keys = {"scene", "light", "bake", "raw_bytes", "left_out", "solves", "results"}
+        assert set(report) == keys
         scene = {"mesh", "points", "faces", "material", "rows", "channels"}
         assert set(report["scene"]) - {"warnings"} == scene
         assert set(report["light"]) == {"basis", "coeffs"}
@@ -380,7 +381,7 @@ class TestWholeRun:
         assert "cpca 8x2" in page
         assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", page)
 
-    def test_second_start_takes_what_is_there(self, monkeypatch, finished):
+    def test_second_start_takes_what_is_there(self, monkeypatch, capsys, finished):
         shutil.copytree(finished, ".", dirs_exist_ok=True)
         before = tree()
 
@@ -388,7 +389,10 @@ class TestWholeRun:
             raise AssertionError("fitted again")
 
         monkeypatch.setattr("prt_torch.run.fit", refuse_to_work)
+        monkeypatch.setattr("prt_torch.solves.STIFF", 1.0)
         assert MAINS[FIT](arguments()) == 0
+        told = "stiff: cpca 8x2: closed form: condition 1.9e+00 may cost 0.3 of the 15.7 digits"
+        assert f"warning: {told}" in capsys.readouterr().out
         after = tree()
         assert after.keys() == before.keys()
         timed = {"out/report.json", "out/report.html", "out/manifest.json"}
@@ -396,6 +400,10 @@ class TestWholeRun:
         report = json.loads(after["out/report.json"])
         assert report["bake"]["cached"] is True
         earlier = json.loads(before["out/report.json"])
+        first, again = (one["solves"][0] for one in (earlier, report))
+        assert first["warning"] is None
+        assert told in again["warning"]
+        assert {**first, "warning": again["warning"]} == again
         timings = ("relight_seconds", "dense_seconds")
         for result in (report["results"][0], earlier["results"][0]):
             assert all(result.pop(key) > 0 for key in timings)

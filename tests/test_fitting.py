@@ -10,7 +10,13 @@ from prt_torch.bases import CubeDirections, SphericalHarmonics
 from prt_torch.errors import InputError
 from prt_torch.fitting import fit
 from prt_torch.metric import Metric
-from prt_torch.representations import CPCA, DenseTransfer
+from prt_torch.representations import (
+    CPCA,
+    ClusteredTensor,
+    DenseTransfer,
+    ScatteredSRBF,
+    undetermined,
+)
 from prt_torch.transfer import TransferTensor
 
 
@@ -188,3 +194,34 @@ def test_fitting_for_a_light_prior_lowers_radiance_errors_under_it():
             for m in (None, prior)
         ]
     assert errors[1] < 0.9 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "plenty", "enough"),
+    [  # three different points have two directions beside their mean
+        (CPCA, {"num_clusters": 1, "rank": 3}, {"num_clusters": 1, "rank": 2}),
+        (
+            ClusteredTensor,
+            {"num_clusters": 2, "ranks": (1, 9, 2)},
+            {"num_clusters": 1, "ranks": (1, 9, 3)},
+        ),
+        (
+            ScatteredSRBF,
+            {"num_clusters": 1, "num_functions": 11},
+            {"num_clusters": 1, "num_functions": 5},
+        ),
+    ],
+)
+def test_directions_that_the_data_do_not_determine_are_told(kind, plenty, enough):
+    points = torch.randn(3, 9, generator=torch.Generator().manual_seed(0))
+    transfer = TransferTensor.from_dense(
+        points[torch.arange(30) % 3], light_basis=SphericalHarmonics(3)
+    )
+    options = {"transfer": transfer, "max_steps": 0}
+    model = kind.from_transfer(transfer, **plenty)
+    assert fit(model, **options).status == "rank_deficient"
+    assert fit(kind.from_transfer(transfer, **enough), **options).status == "closed_form"
+    assert fit(model, transfer, max_steps=1).status != "rank_deficient"
+    zero = TransferTensor.from_dense(torch.zeros(30, 9), light_basis=SphericalHarmonics(3))
+    if kind is not ScatteredSRBF:
+        assert undetermined(kind.from_transfer(zero, **enough)) > 0

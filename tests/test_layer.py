@@ -90,8 +90,9 @@ def made(kind: str, transfer: TransferTensor | None = None) -> Relighter:
 
 @functools.cache
 def shared(kind: str) -> Relighter:
-    """One that no test writes to."""
-    return made(kind)
+    """One that no test writes to, made outside the inference mode of the test that asks first."""
+    with torch.inference_mode(False):
+        return made(kind)
 
 
 @functools.cache
@@ -307,6 +308,16 @@ def test_copies(kind, said):
     assert torch.equal(other.eval()(LIGHT, EYES), wanted)
     for one, two in zip(relight.state_dict().values(), other.state_dict().values(), strict=True):
         assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("kind", BUDGETS)
+def test_geometry_goes_where_the_module_goes(kind):
+    rest = glossy().surface
+    rounded = made(kind).to(torch.bfloat16).representation
+    assert torch.equal(rounded.surface.frames, rest.frames)  # casting parameters moves no point
+    assert torch.equal(rounded.surface.positions, rest.positions)
+    surface = made(kind).to("meta").representation.surface  # a device that every machine has
+    assert {surface.frames.device.type, surface.positions.device.type} == {"meta"}
 
 
 @rows_of("refuses a checkpoint of other clusters")

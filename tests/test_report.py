@@ -20,12 +20,13 @@ from prt_torch.report import (
     error_against_bytes,
     error_against_time,
     gather,
+    solves_table,
     summary_table,
     write_html,
 )
 from prt_torch.report import numbers as text
 from prt_torch.report.labels import place_labels
-from prt_torch.report.outcome import outcomes, uncompressed_reference_error
+from prt_torch.report.outcome import endings, outcomes, uncompressed_reference_error
 from prt_torch.report.plots import DARK
 
 RAW_BYTES = 7104 * 64 * 4
@@ -50,6 +51,11 @@ def make_result(name: str, size: int, error: float | None, **more) -> dict:
     return result | more
 
 
+def make_solve(what: str, **more) -> dict:
+    known = {"condition": 1.5e5, "digits_lost": 5.18, "dtype": "float64", "warning": None}
+    return {"what": what, "status": "solved", **known, **more}
+
+
 def make_report(results: list[dict]) -> dict:
     return {
         "scene": {
@@ -67,6 +73,11 @@ def make_report(results: list[dict]) -> dict:
         "left_out": [
             {"what": "colour channels", "why": "colour factors out", "saved_bytes": 3637248},
             {"what": "interreflection", "why": "adds < 0.1 %", "saved_seconds": 41.2},
+        ],
+        "solves": [
+            make_solve("exit basis: Gram matrix"),
+            make_solve("light [b]", status="regularised", condition=None, warning="stiff: <so>"),
+            make_solve("cpca: refinement", status="max_steps", condition=None, digits_lost=None),
         ],
         "results": results,
     }
@@ -117,12 +128,13 @@ def write_page(path, report: dict, pictures=()) -> str:
 
 @pytest.mark.usefixtures("quick_plots")
 def test_page_contains_every_result_and_fact(tmp_path, report):
-    report["results"][3]["status"] = "nonfinite"
     page = Page(write_page(tmp_path / "report.html", report))
     for result in report["results"]:
-        assert page.texts.count(result["name"]) == 2, "in the results and in how it ended"
+        assert page.texts.count(result["name"]) == 1
+    for solve in report["solves"]:
+        assert {solve["what"], solve["status"]} <= set(page.texts)
     whole = " ".join(page.texts)
-    for fact in ("7,104", "174,587,904", "SH order 8", "3 edges <have> one face", "nonfinite"):
+    for fact in ("7,104", "174,587,904", "SH order 8", "3 edges <have> one face", "stiff: <so>"):
         assert fact in whole
     for entry in report["left_out"]:
         assert entry["what"] in page.texts
@@ -152,6 +164,7 @@ def test_page_escapes_all_text(tmp_path):
     report["scene"]["mesh"] = report["scene"]["material"] = report["light"]["basis"] = hostile
     report["scene"]["warnings"][0]["message"] = hostile
     report["left_out"] = [{"what": hostile, "why": hostile, "saved_bytes": 1}]
+    report["solves"] = [make_solve(hostile, status=hostile, warning=hostile)]
     plain = Page(write_page(tmp_path / "plain.html", make_report([make_result("a", 1000, 0.1)])))
     png = encode_png(np.zeros((2, 2, 3), np.uint8))
     picture = Picture(hostile, hostile, png, hostile)
@@ -159,7 +172,7 @@ def test_page_escapes_all_text(tmp_path):
     assert page.tags.count("img") == plain.tags.count("img") + 1
     assert page.tags.count("script") == 1
     # Parsed back, the text is what was given, in each of the places.
-    assert sum(hostile in piece for piece in page.texts) >= 10
+    assert sum(hostile in piece for piece in page.texts) >= 12
 
 
 @pytest.mark.usefixtures("quick_plots")
@@ -285,6 +298,21 @@ def test_table_holds_every_value(report):
     assert re.split(r"\s{2,}", line.strip())[1:] == expected
 
 
+def test_solves_are_told_with_what_they_cost(report):
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(solves_table(report))
+    lines = console.export_text(styles=True).splitlines()[3:6]
+    found = [re.split(r"\s{2,}", re.sub(r"\x1b\[[\d;]*m", "", line).strip()) for line in lines]
+    assert found == [
+        ["exit basis: Gram matrix", "1.50e+05", "5.2", "solved"],
+        ["light [b]", "–", "5.2", "regularised"],
+        ["cpca: refinement", "–", "–", "max_steps"],
+    ]
+    report["solves"][0]["warning"] = "stiff"
+    report["solves"][2]["status"] = "nonfinite"
+    assert [one.rating for one in endings(report)] == ["warn", "warn", "bad"]
+
+
 @pytest.mark.usefixtures("quick_plots")
 def test_gathered_runs_keep_their_own_facts_and_distinct_names(tmp_path):
     first = make_report([make_result("cpca", 5000, 0.1), make_result("wavelet", 9000, 0.01)])
@@ -302,7 +330,7 @@ def test_gathered_runs_keep_their_own_facts_and_distinct_names(tmp_path):
     page = Page(write_page(tmp_path / "report.html", joint))
     for expected in ("sh: scene", "haar: scene", "SH order 8", "Haar 8", "sh: cpca", "haar: cpca"):
         assert expected in page.texts
-    assert "sh: colour channels" in page.texts
+    assert {"sh: colour channels", "haar: exit basis: Gram matrix"} <= set(page.texts)
     assert summary_table(joint).row_count == 4
     with pytest.raises(ValueError, match="distinct name"):
         gather([first, second], ["a", "a"])

@@ -5,7 +5,6 @@ coefficients are mean radiances, transfer values are integrals of transfer over 
 included), and the Gram matrix is :math:`\operatorname{diag}(1/\Omega_j)`.
 """
 
-import functools
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch.bases.base import LightBasis, Radiance
+from prt_torch.bases.tables import kept_property
 from prt_torch.sphere import cubemap_directions, cubemap_index, cubemap_solid_angles
 
 
@@ -105,7 +105,7 @@ class CubeDirections(LightBasis):
         """Mean radiances of texels, each times the square root of its solid angle."""
         return light * self._root_solid_angles.to(light)[:, None]
 
-    @functools.cached_property
+    @kept_property
     def _root_solid_angles(self) -> Float[Tensor, "coeffs"]:
         return self.solid_angles.sqrt()
 

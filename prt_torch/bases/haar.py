@@ -21,7 +21,6 @@ Source:
     Tran, Luebke 2004, section 3.3 (whole faces); both after Ng, Ramamoorthi, Hanrahan 2003.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +30,7 @@ from torch import Tensor
 
 from prt_torch.bases.base import LightBasis, Radiance
 from prt_torch.bases.cube import CubeDirections
+from prt_torch.bases.tables import kept_property
 
 _BLOCK_BYTES = 2**20  # of images transformed at once on a processor: they stay in its cache
 
@@ -304,6 +304,6 @@ class Haar(LightBasis):
     def _of_radiance(self, radiance: Float[Tensor, "*batch coeffs rgb"]) -> Tensor:
         return self._of_texels(radiance.mT).mT.contiguous()
 
-    @functools.cached_property
+    @kept_property
     def _root_solid_angles(self) -> Float[Tensor, "segments row col"]:
         return self._segmented(self._cube.solid_angles.sqrt())

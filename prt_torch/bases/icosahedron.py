@@ -5,18 +5,19 @@ Each step puts a point in the middle of every edge, on the sphere, so a face bec
 at 642.
 """
 
-import functools
 import math
 
 import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
+from prt_torch.bases.tables import kept
+
 ICOSAHEDRAL_COUNTS = (12, 42, 162, 642, 2562)
 """Numbers of points after 0 to 4 subdivisions."""
 
 
-@functools.lru_cache
+@kept
 def icosahedral_centers(subdivisions: int) -> Float64[Tensor, "centers 3"]:
     """Unit vectors to the corners of a subdivided icosahedron, always in the same order.
 
@@ -39,7 +40,7 @@ def icosahedral_centers(subdivisions: int) -> Float64[Tensor, "centers 3"]:
     return points
 
 
-@functools.lru_cache
+@kept
 def smallest_distance(subdivisions: int) -> float:
     """Angle between the two closest points of :func:`icosahedral_centers` [rad]."""
     points = icosahedral_centers(subdivisions)

@@ -13,7 +13,6 @@ Source:
     Tsai, Shih 2006, sections 3 and 4.
 """
 
-import functools
 import math
 from dataclasses import replace
 from typing import Any
@@ -43,10 +42,12 @@ from prt_torch.bases.srbf_kernels import (
 )
 from prt_torch.bases.srbf_light import SRBFExpansion
 from prt_torch.bases.srbf_projection import Fit, collocation_projection, gram_projection
+from prt_torch.bases.tables import kept_property, traced_without_numbers
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles
 
 __all__ = [
     "SRBF",
+    "WORST_CONDITION",
     "Fit",
     "KernelName",
     "SRBFExpansion",
@@ -62,9 +63,11 @@ __all__ = [
     "icosahedral_centers",
 ]
 
+WORST_CONDITION = 1e8
+"""Of a Gram matrix as it is used; its Cholesky factor then has 1e4, bearable in float32."""
+
 _PAPER_DEVIATION = math.pi / 40  # rad, with the 642 centres of 3 subdivisions
 _PAPER_SUBDIVISIONS = 3
-_WORST_CONDITION = 1e8  # of a Gram matrix; its Cholesky factor then has 1e4, bearable in float32
 _TABLE_ELEMENTS = 2**18  # of kernel values at once: they stay in a processor's cache
 _SUBSAMPLES = 4  # along a texel's edge, as the paper supersamples
 
@@ -103,16 +106,16 @@ def _subdivisions(num_centers: int) -> int:
     return ICOSAHEDRAL_COUNTS.index(num_centers)
 
 
-def _extremes(matrix: Float[Tensor, "n n"]) -> tuple[float, float]:
+def _extremes(matrix: Float[Tensor, "n n"]) -> Float[Tensor, "2"]:
     """Smallest and largest eigenvalue of a symmetric matrix."""
     eigenvalues = torch.linalg.eigvalsh(matrix)
-    return float(eigenvalues[0]), float(eigenvalues[-1])
+    return torch.stack([eigenvalues[0], eigenvalues[-1]])
 
 
-def _bounded(matrix: Float[Tensor, "n n"], extremes: tuple[float, float]) -> Float[Tensor, "n n"]:
+def _bounded(matrix: Float[Tensor, "n n"], extremes: Float[Tensor, "2"]) -> Float[Tensor, "n n"]:
     """A symmetric matrix with as much of the identity as bounds its condition."""
-    smallest, largest = extremes
-    ridge = max(0.0, (largest - _WORST_CONDITION * smallest) / (_WORST_CONDITION - 1.0))
+    smallest, largest = extremes.unbind()
+    ridge = ((largest - WORST_CONDITION * smallest) / (WORST_CONDITION - 1.0)).clamp_min(0.0)
     return matrix + ridge * torch.eye(len(matrix), dtype=matrix.dtype)
 
 
@@ -161,8 +164,7 @@ class SRBF(LightBasis):
             raise ValueError(f"expected a bandwidth above 0 and below {most}, got {bandwidth}")
         self._cube = CubeDirections(resolution)
         self.resolution = resolution
-        self._tables: dict[tuple[torch.dtype, torch.device], Tensor] = {}
-        self._texel_root: Tensor = torch.empty(0, 0)  # Cholesky, of means over texels; with a table
+        self._tables: dict[tuple[torch.dtype, torch.device], tuple[Tensor, Tensor]] = {}
 
     @property
     def num_coeffs(self) -> int:
@@ -182,7 +184,7 @@ class SRBF(LightBasis):
     @property
     def condition(self) -> float:
         """Condition number of the kernels' own Gram matrix; infinite where it is singular."""
-        smallest, largest = self._spectrum
+        smallest, largest = self._spectrum.tolist()
         return largest / smallest if smallest > 0.0 else math.inf
 
     def project(self, environment: Radiance) -> Float[Tensor, "coeffs rgb"]:
@@ -227,7 +229,7 @@ class SRBF(LightBasis):
         Raises:
             ValueError: If it is not.
         """
-        return self._cube.project_cube(values, resolution) @ self._table(values)
+        return self._cube.project_cube(values, resolution) @ self._table(values)[0]
 
     def project_texels(
         self, radiance: Float[Tensor, "*batch texels rgb"]
@@ -241,8 +243,8 @@ class SRBF(LightBasis):
             radiance: Of each texel, ``"6 row col"`` flattened.
         """
         flux = radiance * self._cube.solid_angles.to(radiance)[:, None]
-        fitted = self._table(radiance).mT @ flux
-        root = self._texel_root.to(radiance)
+        table, root = self._table(radiance)
+        fitted, root = table.mT @ flux, root.to(radiance)
         return root @ (root.mT @ fitted)  # the table is means of kernels over the Gram of means
 
     def blur(self, values: Float[Tensor, "... coeffs"]) -> Float[Tensor, "..."]:
@@ -252,39 +254,51 @@ class SRBF(LightBasis):
         of a function on texels from its projection is the squared norm of the first, less that of
         the second, plus this.
         """
-        self._table(values)
-        means = torch.linalg.vector_norm(
-            values @ self._texel_root.to(values), dim=-1, dtype=torch.float64
-        )
+        _, root = self._table(values)
+        means = torch.linalg.vector_norm(values @ root.to(values), dim=-1, dtype=torch.float64)
         return self.squared_norm(values) - means.square()
 
     def table_bytes(self, resolution: int) -> int:
         """One float32 a texel of this basis' own cube and kernel, and two float64 Gram matrices."""
         return self.num_coeffs * (4 * self._cube.num_coeffs + 2 * 8 * self.num_coeffs)
 
-    def _table(self, like: Tensor) -> Float[Tensor, "texels coeffs"]:
+    def _table(
+        self, like: Tensor
+    ) -> tuple[Float[Tensor, "texels coeffs"], Float[Tensor, "coeffs coeffs"]]:
+        """What :meth:`_made_table` makes, kept for one type and device."""
+        key = (like.dtype, like.device)
+        if key in self._tables:
+            return self._tables[key]
+        if traced_without_numbers():
+            return self._made_table(like)
+        with torch.inference_mode(False):  # so that gradients can pass through it later
+            self._tables = {key: self._made_table(like)}
+        return self._tables[key]
+
+    def _made_table(
+        self, like: Tensor
+    ) -> tuple[Float[Tensor, "texels coeffs"], Float[Tensor, "coeffs coeffs"]]:
         """Transposed least-squares inverse of the means M of kernels over texels.
 
         With solid angles Ω it is M (Mᵀ Ω M)⁻¹. The Gram matrix in place of Mᵀ Ω M would take the
         function for constant over a texel: it blurs, and norms come out 2 % low at 642 centres.
+
+        Returns:
+            It, like the argument, and the Cholesky factor of Mᵀ Ω M, float64.
         """
-        key = (like.dtype, like.device)
-        if key not in self._tables:
-            fine = self.resolution * _SUBSAMPLES
-            directions = cubemap_directions(fine, dtype=torch.float64).view(-1, 3)
-            solid_angles = cubemap_solid_angles(fine, dtype=torch.float64).view(-1, 1)
-            rows = fine * _SUBSAMPLES  # those of one line of texels
-            means = []
-            for some, weights in zip(directions.split(rows), solid_angles.split(rows), strict=True):
-                shape = (_SUBSAMPLES, self.resolution, _SUBSAMPLES, -1)
-                sums = (self._evaluate(some) * weights).view(shape).sum(dim=(0, 2))
-                means.append(sums / weights.view(shape).sum(dim=(0, 2)))
-            table = torch.cat(means)
-            normal = table.mT @ (table * self._cube.solid_angles[:, None])
-            self._texel_root = torch.linalg.cholesky(_bounded(normal, _extremes(normal)))
-            table = torch.cholesky_solve(table.mT, self._texel_root).mT
-            self._tables = {key: table.to(like).contiguous()}
-        return self._tables[key]
+        fine = self.resolution * _SUBSAMPLES
+        directions = cubemap_directions(fine, dtype=torch.float64).view(-1, 3)
+        solid_angles = cubemap_solid_angles(fine, dtype=torch.float64).view(-1, 1)
+        rows = fine * _SUBSAMPLES  # those of one line of texels
+        means = []
+        for some, weights in zip(directions.split(rows), solid_angles.split(rows), strict=True):
+            shape = (_SUBSAMPLES, self.resolution, _SUBSAMPLES, -1)
+            sums = (self._evaluate(some) * weights).view(shape).sum(dim=(0, 2))
+            means.append(sums / weights.view(shape).sum(dim=(0, 2)))
+        table = torch.cat(means)
+        normal = table.mT @ (table * self._cube.solid_angles[:, None])
+        root = torch.linalg.cholesky(_bounded(normal, _extremes(normal)))
+        return torch.cholesky_solve(table.mT, root).mT.to(like).contiguous(), root
 
     def _evaluate(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k coeffs"]:
         centers, bandwidths = self.centers.to(directions), self.bandwidths.to(directions)
@@ -294,17 +308,17 @@ class SRBF(LightBasis):
         """Inner products of the kernels in closed form; see the class for very wide ones."""
         return _bounded(self._own_gram, self._spectrum)
 
-    @functools.cached_property
+    @kept_property
     def _own_gram(self) -> Float[Tensor, "coeffs coeffs"]:
         own = (self.centers, self.bandwidths)
         return kernel_inner_products(self.kernel, *own, *own)
 
-    @functools.cached_property
-    def _spectrum(self) -> tuple[float, float]:
+    @kept_property
+    def _spectrum(self) -> Float[Tensor, "2"]:
         """Smallest and largest eigenvalue of the Gram matrix of the kernels."""
         return _extremes(self._own_gram)
 
-    @functools.cached_property
+    @kept_property
     def _root(self) -> Float[Tensor, "coeffs coeffs"]:
         """Lower Cholesky factor of the Gram matrix."""
         return torch.linalg.cholesky(self.gram())

@@ -18,7 +18,6 @@ Source:
     Sloan, Luna, Snyder 2005, section 5, equations 24 and 25, whose tables are 32 x 64.
 """
 
-import functools
 import math
 from dataclasses import dataclass
 
@@ -28,6 +27,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from prt_torch.bases import sh
+from prt_torch.bases.tables import kept
 
 _MOST_CELLS = 4096  # along an edge; far beyond any use, below any overflow
 
@@ -174,7 +174,7 @@ def band_table(
     return lit.view(table.num_vertices, *light.shape[:-1], order)
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def _harmonics(order: int, table: LatLongTable) -> Float[Tensor, "vertices coeffs"]:
     """As :func:`harmonics_table`; kept, since a table is made anew whenever the light changes."""
     return sh.evaluate(table.directions().flatten(0, 1), order)

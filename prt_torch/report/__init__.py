@@ -8,13 +8,14 @@ missing, never as a number.
 from prt_torch.report.outcome import gather
 from prt_torch.report.page import Picture, write_html
 from prt_torch.report.plots import error_against_bytes, error_against_time
-from prt_torch.report.summary import summary_table
+from prt_torch.report.summary import solves_table, summary_table
 
 __all__ = [
     "Picture",
     "error_against_bytes",
     "error_against_time",
     "gather",
+    "solves_table",
     "summary_table",
     "write_html",
 ]

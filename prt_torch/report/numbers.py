@@ -62,6 +62,11 @@ def factor_text(value: Number) -> str:
     return MISSING if value is None else f"{_three_digits(value)}×"
 
 
+def digits_text(value: Number) -> str:
+    """A number of decimal digits, such as ``2.7``."""
+    return MISSING if value is None else f"{value:.1f}"
+
+
 def count_text(value: Number) -> str:
     """A count with thousands separated."""
     return MISSING if value is None else f"{value:,.0f}"

@@ -9,6 +9,8 @@ Number = int | float | None
 """A finite number, or None where there is none to show."""
 
 ENDINGS = {
+    "solved": ("good", "as it is"),
+    "regularised": ("warn", "nearly singular: as much was added as bounds its condition"),
     "closed_form": ("good", "no steps were asked for"),
     "converged": ("good", "steps gained less than the tolerance"),
     "max_steps": ("good", "all steps were taken; more might lower the error further"),
@@ -17,7 +19,7 @@ ENDINGS = {
     "rank_deficient": ("warn", "the data leave some directions undetermined"),
     "nonfinite": ("bad", "a value became infinite or NaN; the best state before that was kept"),
 }
-"""How a fit can end: how good that is, and what it means."""
+"""How a fit or a solve can end: how good that is, and what it means."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,36 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Ending:
+    """How one solve of a report ended.
+
+    Attributes:
+        what: Which; with its run before it where there are several.
+        status: A key of :data:`ENDINGS`.
+        condition: None where it is infinite or not known.
+        digits_lost: How many decimal digits the condition may cost; None where it is not known.
+        warning: What is wrong if it is stiff; else empty.
+    """
+
+    what: str
+    status: str
+    condition: Number
+    digits_lost: Number
+    warning: str
+
+    @property
+    def rating(self) -> str:
+        """``good``, ``warn`` or ``bad``."""
+        rating = ENDINGS.get(self.status, ("warn", ""))[0]
+        return "warn" if self.warning and rating == "good" else rating
+
+    @property
+    def meaning(self) -> str:
+        """The status in words, and the warning."""
+        return "; ".join(filter(None, [ENDINGS.get(self.status, ("", ""))[1], self.warning]))
+
+
+@dataclass(frozen=True)
 class Run:
     """Where results come from.
 
@@ -126,6 +158,20 @@ def runs(report: Mapping[str, Any]) -> list[Run]:
 def outcomes(report: Mapping[str, Any]) -> list[Outcome]:
     """The results of a report, in its order."""
     return [_outcome(result, report) for result in report["results"]]
+
+
+def endings(report: Mapping[str, Any]) -> list[Ending]:
+    """The solves of a report, in its order."""
+    return [
+        Ending(
+            what=f"{entry['run']}: {entry['what']}" if "run" in entry else str(entry["what"]),
+            status=str(entry.get("status", "")),
+            condition=number(entry.get("condition")),
+            digits_lost=number(entry.get("digits_lost")),
+            warning=str(entry.get("warning") or ""),
+        )
+        for entry in report.get("solves") or []
+    ]
 
 
 def _outcome(result: Mapping[str, Any], report: Mapping[str, Any]) -> Outcome:
@@ -209,10 +255,13 @@ def gather(
             {"name": run, **{key: report.get(key) for key in shared}}
             for run, report in zip(names, reports, strict=True)
         ],
-        "left_out": [
-            {**entry, "run": run}
-            for run, report in zip(names, reports, strict=True)
-            for entry in report.get("left_out") or []
-        ],
+        **{
+            key: [
+                {**entry, "run": run}
+                for run, report in zip(names, reports, strict=True)
+                for entry in report.get(key) or []
+            ]
+            for key in ("left_out", "solves")
+        },
         "results": results,
     }

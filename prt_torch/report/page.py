@@ -19,16 +19,18 @@ from prt_torch.preview import ERROR_COLORMAP
 from prt_torch.report.numbers import (
     bytes_text,
     count_text,
+    digits_text,
     error_text,
     factor_text,
     percent_text,
     seconds_text,
 )
 from prt_torch.report.outcome import (
-    ENDINGS,
+    Ending,
     Number,
     Outcome,
     Run,
+    endings,
     environments,
     number,
     outcomes,
@@ -77,7 +79,7 @@ def write_html(path: Path, report: Mapping[str, Any], pictures: Sequence[Picture
         _plots(report),
         _pictures(pictures),
         _left_out(report.get("left_out") or []),
-        _endings(rows),
+        _endings(endings(report)),
     ]
     title = escape(_title(report))
     store.write_bytes(
@@ -374,21 +376,24 @@ def _left_out(entries: Sequence[Mapping[str, Any]]) -> str:
 """
 
 
-def _endings(rows: Sequence[Outcome]) -> str:
-    headings = [("Name", "text"), ("Status", "text"), ("Meaning", "text"), ("Condition", "")]
-    cells = []
-    for row in rows:
-        kind, meaning = ENDINGS.get(row.status, ("warn", ""))
-        cells.append(
-            [
-                _Cell(row.name, row.name, "text name"),
-                _Cell(row.status, row.status, f"badge {kind}"),
-                _Cell(meaning, meaning, "text wide"),
-                _Cell(error_text(row.condition), row.condition),
-            ]
-        )
+def _endings(ended: Sequence[Ending]) -> str:
+    if not ended:
+        return ""
+    headings = [("Solve", "text"), ("Status", "text"), ("Meaning", "text")]
+    headings += [("Condition", ""), ("Digits lost", "")]
+    cells = [
+        [
+            _Cell(one.what, one.what, "text name"),
+            _Cell(one.status, one.status, f"badge {one.rating}"),
+            _Cell(one.meaning, one.meaning, "text wide"),
+            _Cell(error_text(one.condition), one.condition),
+            _Cell(digits_text(one.digits_lost), one.digits_lost),
+        ]
+        for one in ended
+    ]
     return f"""<section><h2>How it ended</h2>
 {_table(headings, cells)}
-<p class="note">Condition is how stiff the problem was: errors in the data may grow by as much.</p>
+<p class="note">Condition is how stiff a problem was: errors in the data may grow by as much, which
+costs its decimal logarithm in digits. Gram matrices have the square of their functions'.</p>
 </section>
 """

@@ -1,4 +1,4 @@
-"""The results as a table for the terminal."""
+"""The results and the solves as tables for the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,12 +9,13 @@ from rich.text import Text
 
 from prt_torch.report.numbers import (
     bytes_text,
+    digits_text,
     error_text,
     factor_text,
     percent_text,
     seconds_text,
 )
-from prt_torch.report.outcome import ENDINGS, environments, outcomes
+from prt_torch.report.outcome import ENDINGS, endings, environments, outcomes
 
 _STYLES = {"good": "", "warn": "yellow", "bad": "red"}
 
@@ -54,4 +55,21 @@ def summary_table(report: Mapping[str, Any]) -> Table:
         style = _STYLES[ENDINGS.get(row.status, ("warn", ""))[0]]
         # Text, not markup: names may hold brackets.
         table.add_row(*(Text(cell) for cell in cells), Text(row.status, style=style))
+    return table
+
+
+def solves_table(report: Mapping[str, Any]) -> Table:
+    """One line a solve: its condition, the digits that may cost, and how it ended.
+
+    Args:
+        report: A run dictionary, or several gathered.
+    """
+    table = Table(header_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("solve", overflow="fold")
+    table.add_column("condition", justify="right", no_wrap=True)
+    table.add_column("digits lost", justify="right")
+    table.add_column("status", overflow="fold")
+    for one in endings(report):
+        told = (one.what, error_text(one.condition), digits_text(one.digits_lost))
+        table.add_row(*(Text(cell) for cell in told), Text(one.status, style=_STYLES[one.rating]))
     return table

@@ -14,6 +14,7 @@ from prt_torch.representations.thin_membrane import (
     thin_membrane,
     towards_viewer,
 )
+from prt_torch.representations.undetermined import undetermined
 from prt_torch.representations.wavelet import WaveletTransfer
 from prt_torch.representations.wrinkle import WrinkleMap, wrinkle_texture
 from prt_torch.representations.zonal_lobes import ZonalLobes
@@ -35,5 +36,6 @@ __all__ = [
     "save",
     "thin_membrane",
     "towards_viewer",
+    "undetermined",
     "wrinkle_texture",
 ]

@@ -6,6 +6,7 @@ by ``packed``, which is also what its storage counts. ``tests/contract.py`` hold
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -42,8 +43,23 @@ class Representation(nn.Module, ABC):
 
     @property
     def surface(self) -> Surface:
-        """Bases, frames and reflectance, the reflectance where the module is."""
+        """Bases, frames and reflectance, where the module is."""
         return replace(self._surface, reflectance=self.reflectance)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Representation":
+        """As of any module; frames, positions and materials go to its device, in their own type.
+
+        No buffers: they belong to the mesh, and casting parameters must not round where points are.
+        """
+        super()._apply(fn, recurse)
+        surface, device = self._surface, self.reflectance.device
+        self._surface = replace(
+            surface,
+            frames=None if surface.frames is None else surface.frames.to(device),
+            positions=None if surface.positions is None else surface.positions.to(device),
+            materials=None if surface.materials is None else surface.materials.to(device),
+        )
+        return self
 
     @classmethod
     @abstractmethod

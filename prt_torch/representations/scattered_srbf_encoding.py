@@ -48,6 +48,9 @@ from prt_torch.representations.scattered_srbf_coding import (
 from prt_torch.sphere import cubemap_directions, cubemap_solid_angles
 from prt_torch.transfer import TransferTensor
 
+RELATIVE_CUTOFF = 1e-7
+"""Of singular values, in the solve for weights."""
+
 _SUBSPACE = 8  # vectors of a cluster's transfer that its functions are fitted to
 _PROJECTION_LOSS = 1e-3  # of the energy, that each mode may lose to the projection
 _ROUNDS, _ROUND_STEPS, _LAST_STEPS, _TOLERANCE = 3, 3, 8, 1e-3
@@ -55,7 +58,6 @@ _NEAREST = 8  # clusters that a point may move to, its own among them
 _MOST_TURNS, _TURN_GAIN, _TURN_STEPS = 4, 0.01, 4
 _POINTS = 2**12  # at once
 _MOVED = 0.25  # share of functions that a relocation moves
-_RELATIVE_CUTOFF = 1e-7  # of singular values, in the solve for weights
 _CLUSTERS_AT_ONCE = 16
 _FIT_COPIES = 24  # of a cluster's functions at texels, that a step of its fit makes
 _SEED_BYTES = 40  # of a pair of texels of the map that seeds are taken from
@@ -324,7 +326,7 @@ def _solve(
     of_light = _of_light(metric)
     with one_thread():
         left, singular, right = torch.linalg.svd(of_light.weigh(functions), full_matrices=False)
-    used = singular > _RELATIVE_CUTOFF * singular[:, :1]
+    used = singular > RELATIVE_CUTOFF * singular[:, :1]
     reciprocal = torch.where(used, 1.0 / torch.where(used, singular, 1.0), 0.0)
     solve = (right.mT * reciprocal[:, None]) @ left.mT  # clusters coeffs n
     shape = (*transfer.values.shape[:3], functions.shape[1])

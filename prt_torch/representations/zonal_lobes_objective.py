@@ -38,7 +38,6 @@ Source:
 """
 
 import copy
-import functools
 import math
 from dataclasses import dataclass, fields
 
@@ -47,6 +46,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from prt_torch.bases import sh
+from prt_torch.bases.tables import kept
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class LobeObjective:
         )
 
 
-@functools.lru_cache(maxsize=8)
+@kept
 def _slope_matrices(order: int) -> Float[Tensor, "below 3 coeffs"]:
     """Gradients of lobes' products: harmonics of the band below, from those of the target."""
     products = sh.product_matrix(max(order - 1, 1), 2)[:, [3, 1, 2]]  # below, x y z, coeffs

@@ -29,7 +29,7 @@ _EVALUATIONS_AT_ONCE = 2**18
 def directional_albedo(
     brdf: BRDF, wo: Float[Tensor, "*batch 3"], *, resolution: int = 96
 ) -> Float[Tensor, "*batch channels"]:
-    r"""Integral of :math:`f \cos\theta_i` over the hemisphere of lights; zero below the horizon.
+    r"""Integral of :math:`f \cos\theta_i` over the hemisphere of lights; zero up to the horizon.
 
     Made for checks and tables: computed in float64, without gradients.
 

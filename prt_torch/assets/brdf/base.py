@@ -4,9 +4,9 @@ A BRDF :math:`f(\omega_i, \omega_o)` [1/sr] is radiance towards :math:`\omega_o`
 from :math:`\omega_i`, *without* the cosine. Both directions are unit vectors in the shading frame
 (z = normal, x = tangent) and point away from the surface (:mod:`prt_torch.conventions`).
 
-The horizon is handled once, here: below it a BRDF is zero, and a cosine under 1e-7 counts as 1e-7,
-so that models may divide by cosines. Models see only directions that are safe, which keeps NaN out
-of gradients; nothing is repaired afterwards.
+The horizon is handled once, here: below it a BRDF is zero, and from it on a cosine under 1e-7
+counts as 1e-7, so that models may divide by cosines. Models see only directions that are safe,
+which keeps NaN out of gradients; nothing is repaired afterwards.
 """
 
 import math
@@ -32,9 +32,10 @@ class BRDF(ABC):
     def evaluate(
         self, wi: Float[Tensor, "*#batch 3"], wo: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch channels"]:
-        """Values without the cosine [1/sr]; zero where either direction is not above the surface.
+        """Values without the cosine [1/sr]; zero where either direction is below the horizon.
 
-        Differentiable in both directions; gradients are never NaN. Batch shapes broadcast.
+        On the horizon itself they are the limits from above. Differentiable in both directions;
+        gradients are never NaN. Batch shapes broadcast.
 
         Args:
             wi: Unit vectors towards the light, shading frame.
@@ -44,7 +45,7 @@ class BRDF(ABC):
             In the dtype of the directions, with :attr:`num_channels` channels.
         """
         wi, wo = torch.broadcast_tensors(wi, wo)
-        above = (wi[..., 2] > 0) & (wo[..., 2] > 0)
+        above = (wi[..., 2] >= 0) & (wo[..., 2] >= 0)
         values = self._evaluate_above(_raise(wi, above), _raise(wo, above))
         return torch.where(above[..., None], values, torch.zeros_like(values))
 
