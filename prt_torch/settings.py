@@ -148,6 +148,9 @@ class CPCAConfig(_Section):
     rank: int = Field(4, ge=1, description="vectors a cluster beside its mean")
     method: Literal["iterative", "static", "adaptive"] = "iterative"
     affine: bool = Field(True, description="clusters have means")
+    quantisation_share: float | None = Field(
+        None, gt=0, description="of the error that codes may add; null keeps numbers as they are"
+    )
     max_error: float | None = Field(None, gt=0, description="choose clusters and rank by error")
     max_bytes: int | None = Field(None, ge=1, description="choose clusters and rank by bytes")
     max_relight_seconds: float | None = Field(None, gt=0, description="choose them by time")
@@ -172,7 +175,9 @@ class CPCAConfig(_Section):
         size = f"{self.num_clusters}x{self.rank}"
         for limit, value in self.limits.items():
             size = f"{limit.removeprefix('max_')} {value:g}"
-        return f"{self.name}{method}{linear} {size}{moved}"
+        share = self.quantisation_share
+        coded = f" coded {share:g}" if share else ""
+        return f"{self.name}{method}{linear} {size}{moved}{coded}"
 
     @model_validator(mode="after")
     def _one_limit(self) -> "CPCAConfig":
