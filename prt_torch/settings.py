@@ -270,12 +270,17 @@ class ZonalLobesConfig(_Section):
     effort: Literal["default", "fast"] = Field("default", description="of the search for axes")
     ridge: float = Field(1e-7, ge=1e-12, le=1, description="keeps lobes from growing without bound")
     bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
+    quantisation_share: float | None = Field(
+        None, gt=0, description="of the error that codes may add, compressed, in place of bits"
+    )
 
     @property
     def label(self) -> str:
         """Name of the result."""
         effort = "" if self.effort == "default" else f" {self.effort}"
         bits = "" if self.bits else " float"
+        share = self.quantisation_share
+        bits = f" coded {share:g}" if share else bits
         return f"{self.name} {self.num_lobes}{effort}{bits}"
 
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from prt_torch.metric import Metric
 from prt_torch.representations.base import CodedRepresentation
-from prt_torch.representations.cpca_coding import Coding, coded, file_metric, pack, unpack
+from prt_torch.representations.cpca_coding import Coding, coded, pack, unpack
 from prt_torch.representations.cpca_encoding import Encoding, Method, encode
 from prt_torch.representations.cpca_layout import VectorLayout
 from prt_torch.representations.cpca_search import Shape, random_encoding, search
@@ -201,7 +201,7 @@ class CPCA(CodedRepresentation):
             self.shape[1:],
             float(processes.sum(error.to(self.labels.device))),
             share=share,
-            metric=file_metric(metric, self.surface),
+            metric=metric.in_float32(),
             processes=processes,
         )
         return CPCA(encoding, self.surface, self.shape, coding)

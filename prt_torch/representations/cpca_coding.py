@@ -24,7 +24,6 @@ import torch
 from jaxtyping import Bool, Float, Int, Int16
 from torch import Tensor
 
-from prt_torch.bases import LightBasis
 from prt_torch.metric import Metric
 from prt_torch.quantize import (
     compress,
@@ -158,16 +157,6 @@ def coded(
     return cut, Coding(step, levels, metric)
 
 
-def file_metric(metric: Metric, surface: Surface) -> Metric:
-    """The metric as a file can hold it: a prior in float32, everything else by the surface."""
-    match metric.light:
-        case None | LightBasis():
-            light = surface.light_basis
-        case factor:
-            light = factor.float().double()
-    return Metric(metric.name, light, surface.exit_basis.gram_root())
-
-
 def pack(
     encoding: Encoding, coding: Coding | None, shape: tuple[int, int, int]
 ) -> dict[str, Tensor]:
@@ -198,7 +187,7 @@ def pack(
         plain["weights"] = encoding.weights.view(len(labels), int(encoding.ranks.max()))
         return plain
     by_spread = _by_spread(encoding.labels, encoding.ranks, encoding.affine, coding.levels)
-    packed = {
+    return {
         "step": coding.step.clone(),
         "levels": coding.levels.clone(),
         "ranks": ranks,
@@ -207,12 +196,8 @@ def pack(
         "weight_stream": compress(
             coding.weight_codes(encoding.weights)[_entries(encoding, by_spread)], signed=True
         ),
+        **coding.metric.to_file(),
     }
-    light = coding.metric.light
-    if light is None or isinstance(light, LightBasis):
-        return packed
-    rows, columns = torch.tril_indices(len(light), len(light))
-    return {**packed, "light_factor": light[rows, columns].float()}
 
 
 def unpack(
@@ -230,13 +215,7 @@ def unpack(
     by_spread = _by_spread(labels, ranks, affine, levels)
     vector_codes = torch.empty_like(codes).view(len(levels), values)
     vector_codes[by_spread] = codes.view(values, len(levels)).mT
-    light = surface.light_basis
-    if "light_factor" in packed:
-        light = levels.new_zeros(shape[3], shape[3], dtype=torch.float64)
-        rows, columns = torch.tril_indices(shape[3], shape[3])
-        light[rows, columns] = packed["light_factor"].double()
-    name = "light_prior" if "light_factor" in packed else "l2"
-    metric = Metric(name, light, surface.exit_basis.gram_root())
+    metric = Metric.from_file(packed, surface.light_basis, surface.exit_basis)
     coding = Coding(packed["step"], levels, metric)
     dtype = surface.reflectance.dtype
     vectors = coding.vectors_at(vector_codes.view(-1, *own_shape), dtype).flatten(1)
