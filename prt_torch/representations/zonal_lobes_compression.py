@@ -85,6 +85,7 @@ class LobeCoding:
         dtype: torch.dtype,
     ) -> Lobes:
         """What codes stand for."""
+        axes, codes = axes.contiguous(), codes.contiguous()  # products round by their strides
         unknowns = torch.empty(codes.shape, dtype=dtype, device=codes.device)
         for some in self._slices(axes):
             factor, _ = self._factor(axes[some])
