@@ -124,12 +124,12 @@ class Metric:
         return cls("light_prior", factor, exit_basis.gram_root())
 
     def in_float32(self) -> "Metric":
-        """The same to the precision that files keep a prior in."""
+        """The same as a file gives a prior back: in its precision, and row by row."""
         match self.light:
             case None | LightBasis():
                 return self
             case factor:
-                return replace(self, light=factor.float().double())
+                return replace(self, light=factor.float().double().contiguous())
 
     def weigh(self, values: Float[Tensor, "... rows coeffs"]) -> Float[Tensor, "... rows coeffs"]:
         """Into the space where errors are sums of squares; may be ``values`` itself."""
