@@ -232,13 +232,17 @@ class ClusteredTensorConfig(_Section):
         Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
     ] = Field((16, 48, 24), description="of rows, light coefficients and points of a cluster")
     bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
+    quantisation_share: float | None = Field(
+        None, gt=0, description="of the error that codes may add, compressed, in place of bits"
+    )
     tolerance: float = Field(1e-4, ge=0, lt=1, description="gain of a turn that ends a phase")
     max_turns: int = Field(40, ge=1, description="of each phase")
 
     @property
     def label(self) -> str:
         """Name of the result."""
-        bits = "" if self.bits else " float"
+        share = self.quantisation_share
+        bits = f" coded {share:g}" if share else "" if self.bits else " float"
         return f"{self.name} {self.num_clusters}x{'/'.join(map(str, self.ranks))}{bits}"
 
 

@@ -123,7 +123,7 @@ def _read_segments(model: SegmentedCPCA, wanted: Parameters, problem: Problem) -
 
 NESTINGS: dict[str, Nesting] = {
     "cpca": Nesting("rank", 1.6, _read_cpca, {"method": ["adaptive"]}, ("quantisation_share",)),
-    "clustered_tensor": Nesting("ranks", 3.0, _read_tensor),
+    "clustered_tensor": Nesting("ranks", 3.0, _read_tensor, without=("quantisation_share",)),
     "scattered_srbf": Nesting("num_functions", 3.0, _read_functions),
     "segmented_cpca": Nesting("rank", 2.0, _read_segments),
     "wavelet": Nesting("num_terms", float("inf"), _read_terms),
