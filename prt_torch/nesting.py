@@ -73,16 +73,21 @@ class Nesting:
         reach: How many times smaller than what was fitted a point may be.
         read: Makes the point of these parameters from the fitted one.
         unless: Values of other parameters that rule it out.
+        without: Parameters that rule it out where they are given.
     """
 
     axis: str
     reach: float
     read: Callable[[Any, Parameters, Problem], Representation]
     unless: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    without: Sequence[str] = ()
 
     def applies(self, parameters: Parameters) -> bool:
         """Whether representations with these parameters can be read off."""
-        return not any(parameters.get(name) in ruled for name, ruled in self.unless.items())
+        given = any(parameters.get(name) is not None for name in self.without)
+        return not given and not any(
+            parameters.get(name) in ruled for name, ruled in self.unless.items()
+        )
 
     def within_reach(self, smaller: Any, fitted: Any) -> bool:
         """Whether a value of the axis is near enough below a fitted one."""
@@ -117,8 +122,8 @@ def _read_segments(model: SegmentedCPCA, wanted: Parameters, problem: Problem) -
 
 
 NESTINGS: dict[str, Nesting] = {
-    "cpca": Nesting("rank", 1.6, _read_cpca, {"method": ["adaptive"]}),
-    "clustered_tensor": Nesting("ranks", 3.0, _read_tensor),
+    "cpca": Nesting("rank", 1.6, _read_cpca, {"method": ["adaptive"]}, ("quantisation_share",)),
+    "clustered_tensor": Nesting("ranks", 3.0, _read_tensor, without=("quantisation_share",)),
     "scattered_srbf": Nesting("num_functions", 3.0, _read_functions),
     "segmented_cpca": Nesting("rank", 2.0, _read_segments),
     "wavelet": Nesting("num_terms", float("inf"), _read_terms),

@@ -13,11 +13,16 @@ float64: the step of denormal numbers underflows in their own type.
 Range and rounding are symmetric about zero, so negating values negates codes. A step is a constant
 to gradients; :func:`straight_through` lets them pass to the values as if nothing were rounded.
 
+Codes are packed side by side in a fixed number of bits, or compressed to about their entropy: where
+one step serves numbers of very different size, most codes are small, and a fixed width is that of
+the few that are not.
+
 Source:
     Wang, Tran, Luebke 2004, section 3.3 (signed uniform codes; 11, 11 and 10 bits in four bytes);
-    Liu, Sloan, Shum, Snyder 2004, section 5 (16 bits).
+    Liu, Sloan, Shum, Snyder 2004, section 5 (16 bits). Compression is ours.
 """
 
+import lzma
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -28,6 +33,9 @@ from torch import Tensor
 
 _GROUP = 8  # codes that end on a whole byte, whatever their bits
 _CODES_AT_ONCE = 2**18  # keeps the 64-bit intermediates of packing in the cache
+_COMPRESSION = [  # an adaptive range coder over bytes, in the context of the byte before
+    {"id": lzma.FILTER_LZMA2, "dict_size": 2**20, "lc": 4, "lp": 0, "pb": 0, "nice_len": 64}
+]
 
 
 def largest_code(bits: int) -> int:
@@ -263,6 +271,65 @@ def unpack_fields(
         fields.append(_signed((words.long() >> start) & ((1 << width) - 1), width))
         start += width
     return torch.stack(fields, dim=-1)
+
+
+def compress(values: Integer[Tensor, "..."], *, signed: bool) -> UInt8[Tensor, "bytes"]:
+    """Integers in about as many bits as their entropy: few where most are small or alike.
+
+    The lowest byte of all values comes first, then the next where any value needs it. Values that
+    go together should lie together: the coder learns as it goes.
+
+    Args:
+        values: Of magnitudes below 2^31; read row by row.
+        signed: Whether some may be negative; signs take the lowest bit then.
+
+    Returns:
+        A raw LZMA2 stream, which other versions of its library may make of another length. What
+        it decompresses to is the same.
+
+    Raises:
+        ValueError: If a value is negative and ``signed`` is not set, or too large.
+    """
+    low, high = (int(bound) for bound in values.aminmax()) if values.numel() else (0, 0)
+    if (low < 0 and not signed) or low <= -(2**31) or high >= 2**31:
+        raise ValueError(f"expected values below 2^31 with signed={signed}, got {low} to {high}")
+    wide = values.detach().long().flatten()
+    folded = torch.where(wide < 0, -2 * wide - 1, 2 * wide) if signed else wide
+    largest = int(folded.max()) if len(folded) else 0
+    planes = [folded >> shift & 0xFF for shift in range(0, max(1, largest.bit_length()), 8)]
+    raw = torch.cat(planes).to(torch.uint8).cpu().numpy().tobytes()
+    stream = bytearray(lzma.compress(raw, format=lzma.FORMAT_RAW, filters=_COMPRESSION))
+    return torch.frombuffer(stream, dtype=torch.uint8).to(values.device)
+
+
+def decompress(
+    compressed: UInt8[Tensor, "bytes"], count: int, *, signed: bool
+) -> Int64[Tensor, "values"]:
+    """The inverse of :func:`compress`, flat.
+
+    Args:
+        compressed: Bytes of :func:`compress`.
+        count: How many values there are.
+        signed: As it was.
+
+    Raises:
+        ValueError: If these are no such bytes, or of another number of values.
+    """
+    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_COMPRESSION)
+    stream = compressed.cpu().numpy().tobytes()
+    try:
+        raw = decoder.decompress(stream, max_length=4 * count + 1)  # no more, whatever they say
+    except (lzma.LZMAError, EOFError) as error:
+        raise ValueError(f"expected compressed codes, got {len(stream)} other bytes") from error
+    planes = len(raw) // max(count, 1)
+    if len(raw) != planes * count or (count and not 1 <= planes <= 4):
+        raise ValueError(f"expected {count} codes of 1 to 4 bytes, got {len(raw)} bytes")
+    if count == 0:
+        return torch.zeros(0, dtype=torch.int64, device=compressed.device)
+    by_plane = torch.frombuffer(bytearray(raw), dtype=torch.uint8).view(planes, count).long()
+    shifts = 8 * torch.arange(planes)[:, None]
+    folded = (by_plane << shifts).sum(0).to(compressed.device)
+    return torch.where(folded % 2 == 1, -(folded + 1) // 2, folded // 2) if signed else folded
 
 
 def least_unsigned(values: Integer[Tensor, "..."], largest: int) -> Integer[Tensor, "..."]:

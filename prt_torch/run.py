@@ -290,7 +290,8 @@ def _clustered(
     if wanted.reclassify:
         faces, budget, metric = inputs.mesh.faces, wanted.reclassify, common["metric"]
         model = reclassified(model, transfer, faces, budget=budget, metric=metric)
-    return model
+    share = wanted.quantisation_share
+    return model.coded(transfer, share=share, metric=common["metric"]) if share else model
 
 
 def _fit_one(

@@ -148,6 +148,9 @@ class CPCAConfig(_Section):
     rank: int = Field(4, ge=1, description="vectors a cluster beside its mean")
     method: Literal["iterative", "static", "adaptive"] = "iterative"
     affine: bool = Field(True, description="clusters have means")
+    quantisation_share: float | None = Field(
+        None, gt=0, description="of the error that codes may add; null keeps numbers as they are"
+    )
     max_error: float | None = Field(None, gt=0, description="choose clusters and rank by error")
     max_bytes: int | None = Field(None, ge=1, description="choose clusters and rank by bytes")
     max_relight_seconds: float | None = Field(None, gt=0, description="choose them by time")
@@ -172,7 +175,9 @@ class CPCAConfig(_Section):
         size = f"{self.num_clusters}x{self.rank}"
         for limit, value in self.limits.items():
             size = f"{limit.removeprefix('max_')} {value:g}"
-        return f"{self.name}{method}{linear} {size}{moved}"
+        share = self.quantisation_share
+        coded = f" coded {share:g}" if share else ""
+        return f"{self.name}{method}{linear} {size}{moved}{coded}"
 
     @model_validator(mode="after")
     def _one_limit(self) -> "CPCAConfig":
@@ -227,13 +232,17 @@ class ClusteredTensorConfig(_Section):
         Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
     ] = Field((16, 48, 24), description="of rows, light coefficients and points of a cluster")
     bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
+    quantisation_share: float | None = Field(
+        None, gt=0, description="of the error that codes may add, compressed, in place of bits"
+    )
     tolerance: float = Field(1e-4, ge=0, lt=1, description="gain of a turn that ends a phase")
     max_turns: int = Field(40, ge=1, description="of each phase")
 
     @property
     def label(self) -> str:
         """Name of the result."""
-        bits = "" if self.bits else " float"
+        share = self.quantisation_share
+        bits = f" coded {share:g}" if share else "" if self.bits else " float"
         return f"{self.name} {self.num_clusters}x{'/'.join(map(str, self.ranks))}{bits}"
 
 
@@ -265,12 +274,17 @@ class ZonalLobesConfig(_Section):
     effort: Literal["default", "fast"] = Field("default", description="of the search for axes")
     ridge: float = Field(1e-7, ge=1e-12, le=1, description="keeps lobes from growing without bound")
     bits: Literal[16] | None = Field(16, description="of a code; null keeps numbers as they are")
+    quantisation_share: float | None = Field(
+        None, gt=0, description="of the error that codes may add, compressed, in place of bits"
+    )
 
     @property
     def label(self) -> str:
         """Name of the result."""
         effort = "" if self.effort == "default" else f" {self.effort}"
         bits = "" if self.bits else " float"
+        share = self.quantisation_share
+        bits = f" coded {share:g}" if share else bits
         return f"{self.name} {self.num_lobes}{effort}{bits}"
 
 

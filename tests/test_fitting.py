@@ -159,7 +159,7 @@ def test_light_prior_is_expected_squared_radiance_error():
     """Squared norm of an error = mean over lights and turns of its squared radiance, plus floor."""
     basis = SphericalHarmonics(3)
     lights = torch.randn(2, 9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    metric = Metric.light_prior(lights, basis, turns=5, floor=0.01)
+    metric = Metric.light_prior(lights, basis, turns=5, shrinkage=0.0, floor=0.01)
     error = torch.randn(9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     total, power = 0.0, 0.0
     for light in lights:
@@ -173,6 +173,20 @@ def test_light_prior_is_expected_squared_radiance_error():
     expected = total * 9 / power + 0.01 * float(error.square().sum())
     assert float(metric.weigh(error[None]).square().sum()) == pytest.approx(expected, rel=1e-10)
     assert torch.allclose(metric.unweigh(metric.weigh(error[None])), error[None])
+
+
+def test_a_light_prior_that_is_shrunk_whole_knows_the_power_of_bands_only():
+    basis = SphericalHarmonics(3)
+    lights = torch.randn(2, 9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    metric = Metric.light_prior(lights, basis, shrinkage=1.0, floor=0.0)
+    units = lights / lights.norm(dim=(1, 2), keepdim=True)
+    for band in range(3):
+        own = slice(band**2, (band + 1) ** 2)
+        power = float(units[:, own].square().sum()) / len(lights) * 9 / (2 * band + 1)
+        weighed = metric.weigh(torch.eye(9, dtype=torch.float64)[:, None])[own, 0]
+        assert torch.allclose(weighed @ weighed.mT, power * torch.eye(2 * band + 1).double())
+    with pytest.raises(ValueError, match="expected a shrinkage"):
+        Metric.light_prior(lights, basis, shrinkage=1.5)
 
 
 def test_fitting_for_a_light_prior_lowers_radiance_errors_under_it():

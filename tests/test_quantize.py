@@ -1,10 +1,14 @@
 """Codes: exact packing, known steps, gradients, and numbers of very different size."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 from prt_torch.quantize import (
+    compress,
+    decompress,
     dequantize,
     full_scale,
     largest_code,
@@ -207,3 +211,33 @@ def test_least_unsigned_takes_the_least_bytes():
         least_unsigned(values, 254)
     with pytest.raises(ValueError, match="got -1 to 0"):
         least_unsigned(torch.tensor([-1, 0]), 254)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+@pytest.mark.parametrize("largest", [0, 1, 127, 128, 40000, 2**31 - 1])
+@pytest.mark.parametrize("signed", [False, True])
+def test_compressed_integers_come_back(count: int, largest: int, signed: bool):
+    generator = torch.Generator().manual_seed(0)
+    least = -largest if signed else 0
+    values = torch.randint(least, largest + 1, (count,), generator=generator)
+    values[:1] = largest
+    assert torch.equal(decompress(compress(values, signed=signed), count, signed=signed), values)
+
+
+def test_compression_comes_near_the_entropy():
+    """Of independent normal numbers: log2(deviation) + 2.05 bits each."""
+    generator = torch.Generator().manual_seed(0)
+    for deviation in (1.0, 4.0):
+        codes = (deviation * torch.randn(40000, generator=generator)).round().long()
+        bits = 8 * len(compress(codes, signed=True)) / len(codes)
+        entropy = 0.5 * math.log2(2 * math.pi * math.e * (deviation**2 + 1 / 12))
+        assert entropy - 0.05 < bits < 1.2 * entropy
+
+
+def test_what_was_not_compressed_is_refused():
+    codes = compress(torch.arange(100), signed=False)
+    for wrong, count in ((codes, 99), (codes[:-20], 100), (codes, 0), (codes.flip(0), 100)):
+        with pytest.raises(ValueError, match="expected"):
+            decompress(wrong, count, signed=False)
+    with pytest.raises(ValueError, match="expected values"):
+        compress(torch.tensor([-1]), signed=False)

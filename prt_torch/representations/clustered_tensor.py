@@ -33,6 +33,9 @@ from prt_torch.representations.clustered_tensor_coding import (
     pack,
     unpack,
 )
+from prt_torch.representations.clustered_tensor_compression import TensorCoding, coding_for
+from prt_torch.representations.clustered_tensor_compression import pack as compressed
+from prt_torch.representations.clustered_tensor_compression import unpack as decompressed
 from prt_torch.representations.clustered_tensor_encoding import (
     Options,
     TensorStatistics,
@@ -60,6 +63,7 @@ class ClusteredTensor(CodedRepresentation):
         encoding: Clusters, bases and weights.
         surface: Bases, frames and reflectance.
         shape: Points, channels, rows, coeffs.
+        coding: In place of the steps of ``encoding``, where numbers are compressed.
 
     Attributes:
         labels: ``"points"``: cluster of each, clusters numbered from the largest to the smallest.
@@ -76,8 +80,17 @@ class ClusteredTensor(CodedRepresentation):
     light_bases: nn.Parameter
     cores: nn.Parameter
     weights: nn.Parameter
+    _step: Tensor | None
+    _core_levels: Tensor | None
+    _light_levels: Tensor | None
 
-    def __init__(self, encoding: Encoding, surface: Surface, shape: tuple[int, int, int, int]):
+    def __init__(
+        self,
+        encoding: Encoding,
+        surface: Surface,
+        shape: tuple[int, int, int, int],
+        coding: TensorCoding | None = None,
+    ):
         super().__init__(surface, shape)
         self.bits: Literal[16] | None = None if encoding.steps is None else BITS
         self.statistics: TensorStatistics | None = None
@@ -85,8 +98,13 @@ class ClusteredTensor(CodedRepresentation):
         self._blocks: ClusterBlocks | None = None
         self.register_buffer("labels", encoding.labels)
         self.register_buffer("groups", encoding.groups)
+        self._metric = None if coding is None else coding.metric
+        self.register_buffer("_step", None if coding is None else coding.step)
+        self.register_buffer("_core_levels", None if coding is None else coding.core_levels)
+        self.register_buffer("_light_levels", None if coding is None else coding.light_levels)
+        own = encoding.parameters if coding is None else coding.rounded(encoding.parameters)
         for name in Parameters.names():
-            values = getattr(encoding.parameters, name).detach().contiguous()
+            values = getattr(own, name).detach().contiguous()
             self.register_parameter(name, nn.Parameter(values))
             steps = None if encoding.steps is None else getattr(encoding.steps, name)
             self.register_buffer(f"_{name}_steps", steps)
@@ -100,6 +118,7 @@ class ClusteredTensor(CodedRepresentation):
         num_clusters: int = 140,
         ranks: Sequence[int] = (16, 48, 24),
         bits: Literal[16] | None = 16,
+        quantisation_share: float | None = None,
         tolerance: float = 1e-4,
         max_turns: int = 40,
         memory_budget: int = 4 * 2**30,
@@ -120,6 +139,9 @@ class ClusteredTensor(CodedRepresentation):
                 each; capped at what there is. The paper's 8 of 16 rows lose a fifth of a
                 Cook-Torrance object's energy and save a sixth of the bytes (docs/tsai2006.md).
             bits: Of a code; None keeps parameters as they are, for a lossless budget.
+            quantisation_share: Compress, in place of ``bits``, to codes that may add this share of
+                the squared error (:mod:`prt_torch.representations.clustered_tensor_compression`);
+                at equal bytes, large ranks at a share of 2 to 8 have the least error.
             tolerance: A turn that lowers the squared error by less than this share of it ends a
                 phase.
             max_turns: Of each of the two phases.
@@ -149,6 +171,8 @@ class ClusteredTensor(CodedRepresentation):
             light that matter.
         """
         _check(num_clusters, ranks, bits, tolerance, max_turns)
+        if quantisation_share is not None and not quantisation_share > 0.0:
+            raise ValueError(f"expected a positive share, got {quantisation_share}")
         rows, coeffs, points = ranks
         processes = Processes(process_group)
         options = Options(
@@ -163,13 +187,27 @@ class ClusteredTensor(CodedRepresentation):
         encoding, statistics = encode(
             transfer, num_clusters=num_clusters, ranks=wanted, options=options
         )
-        encoding = encoding if bits is None else encoding.coded(processes)
-        found = cls(encoding, transfer.surface, tuple(transfer.values.shape))
+        coding = None
+        if quantisation_share is not None:
+            coding = coding_for(
+                encoding,
+                statistics.squared_error,
+                share=quantisation_share,
+                metric=options.metric.in_float32(),
+                processes=processes,
+            )
+        elif bits is not None:
+            encoding = encoding.coded(processes)
+        found = cls(encoding, transfer.surface, tuple(transfer.values.shape), coding)
         found.statistics = statistics
         return found
 
     def _rounded(self) -> dict[str, Tensor]:
-        rounded = self._encoding().rounded().parameters
+        encoding, coding = self._encoding(), self._coding()
+        if coding is not None:
+            rounded = coding.rounded(encoding.parameters)
+        else:
+            rounded = encoding.rounded().parameters
         return {name: getattr(rounded, name) for name in Parameters.names()}
 
     def _encoding(self) -> Encoding:
@@ -181,9 +219,18 @@ class ClusteredTensor(CodedRepresentation):
 
     def _values(self) -> Parameters:
         """Parameters as a file would hold them, while gradients refine them."""
-        encoding = self._encoding()
-        rounds = self.training and not self._at_rest
-        return encoding.straight_through() if rounds else encoding.parameters
+        encoding, coding = self._encoding(), self._coding()
+        if not self.training or self._at_rest:
+            return encoding.parameters
+        if coding is not None:
+            return coding.straight_through(encoding.parameters)
+        return encoding.straight_through()
+
+    def _coding(self) -> TensorCoding | None:
+        step, cores, lights = self._step, self._core_levels, self._light_levels
+        if self._metric is None or step is None or cores is None or lights is None:
+            return None
+        return TensorCoding(step, cores, lights, self._metric)
 
     def gathered(self, process_group: distributed.ProcessGroup | None) -> "ClusteredTensor":
         """One model of all processes' points, on every process, from what each has fitted.
@@ -202,7 +249,7 @@ class ClusteredTensor(CodedRepresentation):
             parameters=Parameters(**values, weights=weights),
         )
         surface = processes.gather_surface(self.surface, self.num_points)
-        found = ClusteredTensor(encoding, surface, (len(weights), *self.shape[1:]))
+        found = ClusteredTensor(encoding, surface, (len(weights), *self.shape[1:]), self._coding())
         found.statistics = self.statistics
         return found
 
@@ -297,15 +344,19 @@ class ClusteredTensor(CodedRepresentation):
         return by_row.unflatten(1, (self.num_channels, self.num_rows))
 
     def packed(self) -> dict[str, Tensor]:
-        """Codes with their steps, and labels (:func:`clustered_tensor_coding.pack`)."""
-        return pack(self._encoding())
+        """As :func:`clustered_tensor_compression.pack` or :func:`clustered_tensor_coding.pack`."""
+        coding = self._coding()
+        return pack(self._encoding()) if coding is None else compressed(self._encoding(), coding)
 
     @classmethod
     def from_packed(
         cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
     ) -> "ClusteredTensor":
         """The inverse of :meth:`packed`."""
-        return cls(unpack(packed), surface, shape)
+        if "weight_stream" not in packed:
+            return cls(unpack(packed), surface, shape)
+        encoding, coding = decompressed(packed, shape[0], shape[3], surface.light_basis)
+        return cls(encoding, surface, shape, coding)
 
     def coherence(self, faces: Int[Tensor, "faces 3"]) -> dict[str, float]:
         """How often a face is drawn (:func:`prt_torch.representations.coherence.draws`).

@@ -13,6 +13,7 @@ Source:
     Sloan, Hall, Hart, Snyder 2003, sections 3.3, 4 and 6.
 """
 
+from dataclasses import replace
 from typing import Any, ClassVar, get_args
 
 import torch
@@ -21,17 +22,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from prt_torch.metric import Metric
-from prt_torch.representations.base import Representation
+from prt_torch.representations.base import CodedRepresentation
+from prt_torch.representations.cpca_coding import Coding, coded, pack, unpack
 from prt_torch.representations.cpca_encoding import Encoding, Method, encode
 from prt_torch.representations.cpca_layout import VectorLayout
 from prt_torch.representations.cpca_search import Shape, random_encoding, search
+from prt_torch.representations.cpca_shading import (
+    lit,
+    local_radiance,
+    mix_gathered,
+    mix_grouped,
+)
 from prt_torch.representations.grouped import ClusterBlocks
 from prt_torch.representations.processes import Processes
-from prt_torch.representations.products import matmul_few
 from prt_torch.transfer import Surface, TransferTensor
 
+_BLOCK_BYTES = 2**25
 
-class CPCA(Representation):
+
+class CPCA(CodedRepresentation):
     """Clustered subspaces of transfer.
 
     Parameters are ``representatives`` ``"vectors channels rows coeffs"``, one cluster after the
@@ -44,6 +53,7 @@ class CPCA(Representation):
         encoding: Clusters, representatives and weights.
         surface: Bases, frames and reflectance.
         shape: Points, channels, rows, coeffs.
+        coding: Steps of codes; None where parameters are kept as they are.
 
     Attributes:
         labels: ``"points"``: cluster of each, clusters numbered from the largest to the smallest.
@@ -55,19 +65,30 @@ class CPCA(Representation):
     places: ClassVar[tuple[str, ...]] = ("labels", "ranks")
     labels: Tensor
     ranks: Tensor
+    _step: Tensor | None
+    _levels: Tensor | None
 
-    def __init__(self, encoding: Encoding, surface: Surface, shape: tuple[int, int, int, int]):
+    def __init__(
+        self,
+        encoding: Encoding,
+        surface: Surface,
+        shape: tuple[int, int, int, int],
+        coding: Coding | None = None,
+    ):
         super().__init__(surface, shape)
         self.affine = encoding.affine
         self._blocks: ClusterBlocks | None = None
         self._layout: VectorLayout | None = None
         self._condition = encoding.condition
-        self.representatives = nn.Parameter(
-            encoding.representatives.unflatten(-1, shape[1:]).contiguous()
-        )
-        self.weights = nn.Parameter(encoding.weights)
+        self._metric = None if coding is None else coding.metric
+        values = encoding.representatives.unflatten(-1, shape[1:]).contiguous(), encoding.weights
+        values = values if coding is None else coding.rounded(*values)
+        self.representatives, self.weights = (nn.Parameter(one) for one in values)
         self.register_buffer("labels", encoding.labels)
         self.register_buffer("ranks", encoding.ranks)
+        self.register_buffer("_step", None if coding is None else coding.step)
+        self.register_buffer("_levels", None if coding is None else coding.levels)
+        self._rest()
 
     @classmethod
     def from_transfer(
@@ -78,6 +99,7 @@ class CPCA(Representation):
         rank: int = 4,
         method: Method = "iterative",
         affine: bool = True,
+        quantisation_share: float | None = None,
         memory_budget: int | None = None,
         process_group: distributed.ProcessGroup | None = None,
         metric: Metric | None = None,
@@ -96,6 +118,8 @@ class CPCA(Representation):
                 from there with unequal ranks, within the bytes of equal ones.
             affine: Whether clusters have means. Without, subspaces go through the origin, and
                 the rank must be at least 1.
+            quantisation_share: Keep codes instead of numbers, which may add this share of the
+                squared error (:meth:`coded`).
             memory_budget: Bytes that all of this may take at its peak, the result included and what
                 was there before left out; as much as it takes if not given. Where it is short,
                 points are kept in a temporary file (``TMPDIR``) and read in chunks, which takes
@@ -135,7 +159,52 @@ class CPCA(Representation):
             memory_budget=memory_budget,
             processes=Processes(process_group),
         )
-        return cls(encoding, transfer.surface, tuple(transfer.values.shape))
+        model = cls(encoding, transfer.surface, tuple(transfer.values.shape))
+        if quantisation_share is None:
+            return model
+        return model.coded(
+            transfer, share=quantisation_share, metric=metric, process_group=process_group
+        )
+
+    @torch.no_grad()
+    def coded(
+        self,
+        transfer: TransferTensor,
+        *,
+        share: float,
+        metric: Metric | None = None,
+        process_group: distributed.ProcessGroup | None = None,
+    ) -> "CPCA":
+        """The same in codes, without the vectors that are not worth theirs.
+
+        Args:
+            transfer: What it stands for; read once. With a ``process_group``, the points of this
+                process.
+            share: Of the squared error, which codes may add; down to what 15 bits do. At equal
+                bytes, many vectors at a share of 4 to 8 have the least error.
+            metric: The one it was made in; the L2 norm over light directions if not given.
+            process_group: As in :meth:`from_transfer`.
+
+        Raises:
+            ValueError: If the share is not positive.
+        """
+        if not share > 0.0:
+            raise ValueError(f"expected a positive share, got {share}")
+        metric, processes = metric or Metric.l2(transfer), Processes(process_group)
+        error = torch.zeros(1, dtype=torch.float64)
+        every = torch.arange(self.num_points, device=self.labels.device)
+        for rows, values in transfer.blocks(_BLOCK_BYTES):
+            lost = metric.weigh(self.dense(every[rows]).double() - values)
+            error += lost.square().sum().cpu()
+        encoding, coding = coded(
+            self._encoding(),
+            self.shape[1:],
+            float(processes.sum(error.to(self.labels.device))),
+            share=share,
+            metric=metric.in_float32(),
+            processes=processes,
+        )
+        return CPCA(encoding, self.surface, self.shape, coding)
 
     @classmethod
     def within(
@@ -202,16 +271,38 @@ class CPCA(Representation):
         """
         processes = Processes(process_group)
         labels = processes.gather(self.labels)
-        encoding = Encoding(
-            labels=labels,
+        encoding = replace(
+            self._encoding(), labels=labels, weights=processes.gather(self.weights.detach())
+        )
+        surface = processes.gather_surface(self.surface, self.num_points)
+        return CPCA(encoding, surface, (len(labels), *self.shape[1:]), self._coding())
+
+    def _encoding(self) -> Encoding:
+        return Encoding(
+            labels=self.labels,
             ranks=self.ranks,
             representatives=self.representatives.detach().flatten(1).clone(),
-            weights=processes.gather(self.weights.detach()),
+            weights=self.weights.detach().clone(),
             affine=self.affine,
             condition=self.condition,
         )
-        surface = processes.gather_surface(self.surface, self.num_points)
-        return CPCA(encoding, surface, (len(labels), *self.shape[1:]))
+
+    def _coding(self) -> Coding | None:
+        if self._metric is None or self._step is None or self._levels is None:
+            return None
+        return Coding(self._step, self._levels, self._metric)
+
+    def _values(self) -> tuple[Tensor, Tensor]:
+        """Representatives and weights as a file would hold them, while gradients refine them."""
+        own, coding = (self.representatives, self.weights), self._coding()
+        if coding is None or not self.training or self._at_rest:
+            return own
+        return coding.straight_through(*own)
+
+    def _rounded(self) -> dict[str, Tensor]:
+        own, coding = (self.representatives, self.weights), self._coding()
+        values = own if coding is None else coding.rounded(*own)
+        return dict(zip(("representatives", "weights"), values, strict=True))
 
     @property
     def blocks(self) -> ClusterBlocks:
@@ -250,122 +341,40 @@ class CPCA(Representation):
         """
         if frames is not None:
             raise ValueError("CPCA stores transfer in the rest pose and cannot be posed by frames")
+        representatives, weights = self._values()
         if self._check_light(light):
-            return self._forward_local(light)
-        lit = self._light_representatives(light)  # vectors, rows * rgb * batch
-        wants_grad = lit.requires_grad or self.weights.requires_grad
-        mix = self._mix_grouped if torch.is_grad_enabled() and wants_grad else self._mix_gathered
-        return mix(lit).view(self.num_points, self.num_rows, 3, -1).permute(3, 0, 1, 2)
-
-    def _mix_grouped(self, vectors: Tensor) -> Float[Tensor, "points values"]:
-        """Weighted sums of each point's own vectors, by batched products: fast to differentiate."""
-        slots = self.blocks.to_slots(self.layout.by_point(self.weights))
-        own = self.layout.by_cluster(vectors)
-        if self.affine:
-            mixed = self.blocks.matmul(slots, own[:, 1:], offsets=own[:, 0])
+            return local_radiance(self.layout, self.blocks, representatives, weights, light)
+        vectors = lit(representatives, light)
+        if torch.is_grad_enabled() and (vectors.requires_grad or weights.requires_grad):
+            mixed = mix_grouped(self.layout, self.blocks, vectors, weights)
         else:
-            mixed = self.blocks.matmul(slots, own)
-        return self.blocks.to_points(mixed)
-
-    def _mix_gathered(self, vectors: Tensor) -> Float[Tensor, "points values"]:
-        """The same in one pass that writes every result once and in place: fast to evaluate.
-
-        The lit vectors of all clusters stay in the processor's cache.
-        """
-        return nn.functional.embedding_bag(
-            self.layout.own_vectors,
-            vectors.to(self.weights.dtype),  # autocast, which leaves them short, stops here
-            self.layout.own_borders,
-            mode="sum",
-            per_sample_weights=self.layout.mixture(self.weights),
-            include_last_offset=True,
-        )
-
-    def _light_representatives(self, light: Tensor) -> Float[Tensor, "vectors values"]:
-        vectors, channels, _, coeffs = self.representatives.shape
-        if channels == 1:
-            columns = light.permute(1, 2, 0).reshape(coeffs, -1)
-            lit = matmul_few(self.representatives.view(-1, coeffs), columns)
-        else:
-            by_channel = self.representatives.transpose(0, 1).reshape(channels, -1, coeffs)
-            lit = torch.bmm(by_channel, light.permute(2, 1, 0)).permute(1, 0, 2)
-        return lit.reshape(vectors, self.num_rows * 3 * len(light))
-
-    def _forward_local(self, light: Tensor) -> Tensor:
-        """Each point's own light meets its cluster's representatives, then its weights."""
-        weights = self.layout.by_point(self.weights)
-        own = self.layout.by_cluster(self.representatives)
-        mixture = self.blocks.to_slots(nn.functional.pad(weights, (int(self.affine), 0), value=1.0))
-        by_point = self.blocks.to_slots(light.permute(1, 3, 0, 2))  # slots rgb batch coeffs
-        colours = []
-        for colour in range(3):
-            channel = own[:, :, colour if self.num_channels == 3 else 0]
-            matrices = channel.flatten(1, 2).mT  # clusters, coeffs, vectors * rows
-            lit = self.blocks.matmul(by_point[:, colour], matrices)
-            lit = lit.unflatten(-1, (own.shape[1], self.num_rows))
-            colours.append(torch.einsum("sv,sbvr->sbr", mixture, lit))
-        radiance = self.blocks.to_points(torch.stack(colours, dim=-1))
-        return radiance.permute(1, 0, 2, 3)
+            mixed = mix_gathered(self.layout, vectors, weights)
+        return mixed.view(self.num_points, self.num_rows, 3, -1).permute(3, 0, 1, 2)
 
     def dense(self, points: Tensor | None = None) -> Float[Tensor, "points channels rows coeffs"]:
         """Mean plus weighted vectors of each point."""
-        flat = self.representatives.flatten(1)
+        representatives, weights = self._values()
+        flat = representatives.flatten(1)
         if points is None:
-            values = self._mix_grouped(flat)
+            values = mix_grouped(self.layout, self.blocks, flat, weights)
         else:
             own = self.layout.by_cluster(flat)[self.labels[points]]
-            mixture = self.layout.by_point(self.weights, points)
+            mixture = self.layout.by_point(weights, points)
             mixture = nn.functional.pad(mixture, (int(self.affine), 0), value=1.0)
             values = torch.bmm(mixture[:, None], own)[:, 0]
         return values.view(-1, self.num_channels, self.num_rows, self.num_coeffs)
 
     def packed(self) -> dict[str, Tensor]:
-        """Representatives, weights by point, and cluster numbers in the least whole bytes.
-
-        Where all ranks are the same, representatives are ``"clusters vectors channels rows
-        coeffs"`` and weights ``"points rank"``: the shapes tell the rank and whether there are
-        means. Where they differ, both are flat and ``ranks`` stands beside them.
-        """
-        representatives, weights = self.representatives.detach(), self.weights.detach()
-        labels = _smallest_integers(self.labels, self.num_clusters - 1)
-        if self.layout.uniform:
-            return {
-                "representatives": self.layout.by_cluster(representatives).clone(),
-                "weights": self.layout.by_point(weights).clone(),
-                "labels": labels,
-            }
-        return {
-            "representatives": representatives.clone(),
-            "weights": weights.clone(),
-            "labels": labels,
-            "ranks": _smallest_integers(self.ranks, self.layout.max_rank),
-        }
+        """Numbers, or compressed codes (:func:`prt_torch.representations.cpca_coding.pack`)."""
+        return pack(self._encoding(), self._coding(), self.shape[1:])
 
     @classmethod
     def from_packed(
         cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
     ) -> "CPCA":
         """The inverse of :meth:`packed`."""
-        representatives, weights = packed["representatives"], packed["weights"]
-        labels = packed["labels"].long()
-        if "ranks" in packed:
-            ranks = packed["ranks"].long()
-            means = len(representatives) - int(ranks.sum())
-        else:
-            clusters, vectors = representatives.shape[:2]
-            rank = weights.shape[1]
-            ranks = torch.full((clusters,), rank, device=labels.device)
-            means = vectors - rank
-            representatives = representatives.flatten(0, 1)
-        encoding = Encoding(
-            labels=labels,
-            ranks=ranks,
-            representatives=representatives.flatten(1),
-            weights=weights.flatten().clone(),
-            affine=means > 0,
-            condition=float("nan"),
-        )
-        return cls(encoding, surface, shape)
+        encoding, coding = unpack(packed, surface, shape)
+        return cls(encoding, surface, shape, coding)
 
     @property
     def budget(self) -> dict[str, Any]:
@@ -386,14 +395,3 @@ class CPCA(Representation):
     def condition(self) -> float:
         """Largest over smallest kept singular value, of the worst cluster; NaN if loaded."""
         return self._condition
-
-
-def _smallest_integers(values: Tensor, largest: int) -> Tensor:
-    """In as few bytes as the largest needs."""
-    match largest:
-        case small if small < 2**8:
-            return values.to(torch.uint8)
-        case medium if medium < 2**15:
-            return values.to(torch.int16)
-        case _:
-            return values.to(torch.int32)

@@ -91,6 +91,14 @@ class VectorLayout(nn.Module):
         return ones.index_select(0, self.get_buffer("mixture_weights"))
 
 
+def entry_vectors(
+    labels: Int[Tensor, "points"], ranks: Int[Tensor, "clusters"], affine: bool
+) -> Int[Tensor, "entries"]:
+    """The vector that each weight belongs to."""
+    first = _starts(ranks + int(affine)) + int(affine)
+    return _runs(first[labels], ranks[labels])
+
+
 def _starts(counts: Int[Tensor, "runs"]) -> Int[Tensor, "runs"]:
     """Where each run starts when they lie one after the other."""
     return counts.cumsum(0) - counts

@@ -35,6 +35,9 @@ from prt_torch.bases.zonal_table import LatLongTable
 from prt_torch.metric import Metric
 from prt_torch.representations.base import CodedRepresentation
 from prt_torch.representations.zonal_lobes_coding import BITS, Lobes, on_codes, pack, unpack
+from prt_torch.representations.zonal_lobes_compression import LobeCoding, by_strength, coded
+from prt_torch.representations.zonal_lobes_compression import pack as compressed
+from prt_torch.representations.zonal_lobes_compression import unpack as decompressed
 from prt_torch.representations.zonal_lobes_correspondence import between, corresponding
 from prt_torch.representations.zonal_lobes_search import Effort, search
 from prt_torch.representations.zonal_lobes_shading import radiance, turned
@@ -58,6 +61,7 @@ class ZonalLobes(CodedRepresentation):
         steps: Of codes, as :meth:`Lobes.steps`; None where parameters are kept as they are.
         surface: Bases, frames and reflectance; the rest frames are needed to pose it.
         shape: Points, channels, rows, coeffs.
+        coding: In place of ``steps``, where lobes are compressed.
 
     Attributes:
         table: Size of the table that light at the axes is looked up in; None, at first, for exact
@@ -76,6 +80,8 @@ class ZonalLobes(CodedRepresentation):
     coefficients: nn.Parameter
     linear: nn.Parameter
     _steps: Tensor | None
+    _row_steps: Tensor | None
+    _axis_bits: Tensor | None
 
     def __init__(
         self,
@@ -83,6 +89,7 @@ class ZonalLobes(CodedRepresentation):
         steps: Float[Tensor, "points rows"] | None,
         surface: Surface,
         shape: tuple[int, int, int, int],
+        coding: LobeCoding | None = None,
     ):
         super().__init__(surface, shape)
         self.order = _order(surface, shape[3])
@@ -95,6 +102,9 @@ class ZonalLobes(CodedRepresentation):
             copy = values.clone(memory_format=torch.contiguous_format)
             self.register_parameter(name, nn.Parameter(copy))
         self.register_buffer("_steps", steps)
+        self._metric = None if coding is None else coding.metric
+        self.register_buffer("_row_steps", None if coding is None else coding.steps)
+        self.register_buffer("_axis_bits", None if coding is None else coding.axis_bits)
         self._rest()
 
     @classmethod
@@ -106,6 +116,7 @@ class ZonalLobes(CodedRepresentation):
         effort: Effort = "default",
         ridge: float = 1e-7,
         bits: Literal[16] | None = 16,
+        quantisation_share: float | None = None,
         edges: Int[Tensor, "edges 2"] | None = None,
         metric: Metric | None = None,
         generator: torch.Generator | None = None,
@@ -121,10 +132,13 @@ class ZonalLobes(CodedRepresentation):
             ridge: Share of the squared norms of lobes that is added to the squared error, at least
                 ``1e-12``; keeps pairs of lobes from growing against each other.
             bits: Of a code; None keeps parameters as they are.
+            quantisation_share: Compress lobes, in place of ``bits``, to codes that may add this
+                share of the squared error in the metric; numbers are then fitted anew in it, at the
+                axes' codes (:mod:`prt_torch.representations.zonal_lobes_compression`).
             edges: Pairs of neighbouring points whose lobes are to correspond, so that they can be
                 interpolated (:meth:`at`); points alone have up to a few times less error without.
-            metric: Not used: lobes are fitted in L2 over the sphere, row by row. What errors are
-                worth enters with the refinement by gradients.
+            metric: Of ``quantisation_share`` only: lobes are fitted in L2 over the sphere, row by
+                row. What errors are worth enters with the refinement by gradients.
             generator: Source of random starts; seed 0 if not given.
 
         Raises:
@@ -136,7 +150,8 @@ class ZonalLobes(CodedRepresentation):
             (:mod:`prt_torch.representations.zonal_lobes_objective`) and another search
             (:mod:`prt_torch.representations.zonal_lobes_search`).
         """
-        _check_options(transfer, num_lobes, ridge, bits)
+        _check_options(transfer, num_lobes, ridge, bits, quantisation_share)
+        bits = bits if quantisation_share is None else None
         start = time.perf_counter()
         values = transfer.dense().flatten(1, 2)  # points, rows, coeffs
         values = values.to(torch.promote_types(values.dtype, torch.float32))
@@ -155,8 +170,16 @@ class ZonalLobes(CodedRepresentation):
         if edges is not None:
             lobes = corresponding(lobes, values, edges)
         steps = None if bits is None else lobes.steps()
-        lobes = lobes if steps is None else lobes.rounded(steps)
-        model = cls(lobes, steps, transfer.surface, tuple(transfer.values.shape))
+        lobes, coding = lobes if steps is None else lobes.rounded(steps), None
+        if quantisation_share is not None:
+            lobes, coding = coded(
+                lobes if edges is not None else by_strength(lobes),
+                values,
+                share=quantisation_share,
+                metric=(metric or Metric.l2(transfer)).in_float32(),
+                order=_order(transfer.surface, transfer.num_coeffs),
+            )
+        model = cls(lobes, steps, transfer.surface, tuple(transfer.values.shape), coding)
         model._condition = _worst_condition(lobes, model.order, ridge)
         model.statistics = {
             "largest_coefficient": _largest(lobes.coefficients),
@@ -213,16 +236,26 @@ class ZonalLobes(CodedRepresentation):
 
     def _values(self) -> Lobes:
         """Parameters as a file would hold them, while gradients refine them."""
-        lobes = Lobes(self.axes, self.coefficients, self.linear)
-        if self._steps is None or self._at_rest or not self.training:
+        lobes, coding = Lobes(self.axes, self.coefficients, self.linear), self._coding()
+        if self._at_rest or not self.training:
             return lobes
-        return lobes.straight_through(self._steps)
+        if coding is not None:
+            return coding.straight_through(lobes)
+        return lobes if self._steps is None else lobes.straight_through(self._steps)
 
     def _rounded(self) -> dict[str, Tensor]:
-        lobes = Lobes(self.axes, self.coefficients, self.linear)
+        lobes, coding = Lobes(self.axes, self.coefficients, self.linear), self._coding()
         if self._steps is not None:
             lobes = lobes.rounded(self._steps)
+        elif coding is not None:
+            lobes = coding.rounded(lobes)
         return {name: getattr(lobes, name) for name in Lobes.names()}
+
+    def _coding(self) -> LobeCoding | None:
+        if self._metric is None or self._row_steps is None or self._axis_bits is None:
+            return None
+        low = self.linear.shape[2]
+        return LobeCoding(self._row_steps, self._axis_bits, self._metric, self.order, low)
 
     def forward(
         self, light: Float[Tensor, "batch *points coeffs rgb"], frames: Tensor | None = None
@@ -262,15 +295,20 @@ class ZonalLobes(CodedRepresentation):
         return values.unflatten(1, (self.num_channels, self.num_rows))
 
     def packed(self) -> dict[str, Tensor]:
-        """Codes and steps, or parameters (:func:`zonal_lobes_coding.pack`)."""
-        return pack(Lobes(self.axes, self.coefficients, self.linear), self._steps)
+        """Compressed codes (:func:`zonal_lobes_compression.pack`), codes, or parameters."""
+        lobes, coding = Lobes(self.axes, self.coefficients, self.linear), self._coding()
+        return pack(lobes, self._steps) if coding is None else compressed(lobes, coding)
 
     @classmethod
     def from_packed(
         cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
     ) -> "ZonalLobes":
         """The inverse of :meth:`packed`."""
-        return cls(*unpack(packed), surface, shape)
+        if "lobe_stream" not in packed:
+            return cls(*unpack(packed), surface, shape)
+        order, dtype = _order(surface, shape[3]), surface.reflectance.dtype
+        lobes, coding = decompressed(packed, shape[0], order, dtype)
+        return cls(lobes, None, surface, shape, coding)
 
     @property
     def budget(self) -> dict[str, Any]:
@@ -296,13 +334,15 @@ def _order(surface: Surface, num_coeffs: int) -> int:
 
 
 def _check_options(
-    transfer: TransferTensor, num_lobes: int, ridge: float, bits: int | None
+    transfer: TransferTensor, num_lobes: int, ridge: float, bits: int | None, share: float | None
 ) -> None:
     _order(transfer.surface, transfer.num_coeffs)
     if num_lobes < 1:
         raise ValueError(f"expected at least 1 lobe, got {num_lobes}")
     if bits not in (BITS, None):
         raise ValueError(f"expected 16 bits or None, got {bits!r}")
+    if share is not None and not share > 0.0:
+        raise ValueError(f"expected a positive share, got {share}")
     if not ridge >= zonal.LEAST_RIDGE:
         raise ValueError(f"expected a ridge of at least {zonal.LEAST_RIDGE:g}, got {ridge:g}")
 
