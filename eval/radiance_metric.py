@@ -65,14 +65,21 @@ HELD_OUT = (
 )
 TURNS = (10.0, 100.0, 190.0, 280.0)  # between those of the prior
 GLOSSY = Material(lambertian=False, glossy=CookTorrance(f0=0.5, roughness=0.4))
-SHARES = {"cpca": (4.0, 8.0), "zh": (1.0, 4.0), "cta": (4.0, 16.0)}
+SHARES = {
+    ("cpca", "diffuse"): (4.0, 8.0),
+    ("cpca", "glossy"): (0.25, 1.0),
+    ("zh", "diffuse"): (1.0, 4.0),
+    ("zh", "glossy"): (0.25, 1.0),
+    ("cta", "diffuse"): (1.0, 4.0),
+    ("cta", "glossy"): (0.25, 1.0),
+}
 SIZES: dict[tuple[str, str], Sequence[tuple[int, ...]]] = {
     ("cpca", "diffuse"): [(64, 4), (128, 4), (256, 4), (512, 4), (128, 8), (256, 8), (512, 8)],
-    ("cpca", "glossy"): [(16, 2), (32, 8), (64, 8), (128, 16)],
+    ("cpca", "glossy"): [(16, 2), (32, 8), (64, 16)],
     ("zh", "diffuse"): [(1,), (2,), (3,), (4,)],
     ("zh", "glossy"): [(1,), (2,), (3,)],
     ("cta", "diffuse"): [(32, 1, 16, 4), (64, 1, 24, 8), (128, 1, 24, 8)],
-    ("cta", "glossy"): [(8, 6, 12, 4), (32, 12, 20, 8), (64, 16, 24, 16)],
+    ("cta", "glossy"): [(8, 6, 12, 4), (16, 12, 20, 8), (32, 16, 24, 16)],
 }
 """Clusters and rank; lobes; clusters and ranks of view, light and points."""
 
@@ -104,13 +111,14 @@ class Judge:
     Args:
         transfer: The tensor.
         lights: Folder of environments.
+        shares: Of squared error, that codes may add.
     """
 
-    def __init__(self, transfer: TransferTensor, lights: Path):
+    def __init__(self, transfer: TransferTensor, lights: Path, shares: Sequence[float]):
         basis = transfer.surface.light_basis
         if not isinstance(basis, SphericalHarmonics):
             raise ValueError("expected transfer in spherical harmonics")
-        self.transfer, self._basis = transfer, basis
+        self.transfer, self.shares, self._basis = transfer, shares, basis
         self._rows = Metric("l2", None, transfer.surface.exit_basis.gram_root())
         fitted = self._project(lights, FITTED)
         exit_basis = transfer.surface.exit_basis
@@ -173,9 +181,8 @@ def compare(arguments: list[str]) -> None:
         transfer = bake(mesh, materials=glossy, light_basis=SphericalHarmonics(5), **baking)
     else:
         transfer = bake(mesh, **baking)
-    judge = Judge(
-        _some_points(transfer, int(options["points"])), Path(options["lights"] or assets / "env")
-    )
+    transfer = _some_points(transfer, int(options["points"]))
+    judge = Judge(transfer, Path(options["lights"] or assets / "env"), SHARES[method, material])
     sizes = SIZES[method, material]
     shape = tuple(judge.transfer.values.shape)
     print(f"{mesh.name}, {material}, {method}: {shape}\n", flush=True)
@@ -207,7 +214,7 @@ def cpca_curves(judge: Judge, size: tuple[int, ...]) -> Iterator[tuple[str, Poin
             numbers = model.weights.numel() + model.representatives.numel()
             labels = model.packed()["labels"].nbytes
             yield "16 bits", judge(name, model, 2 * numbers + labels)
-        for share in SHARES["cpca"]:
+        for share in judge.shares:
             found = model.coded(transfer, share=share, metric=metric)
             note = _floor(found, transfer, metric)
             yield curve, judge(f"{name} share {share:g}", found, _stored(found), note)
@@ -221,7 +228,7 @@ def zonal_curves(judge: Judge, size: tuple[int, ...]) -> Iterator[tuple[str, Poi
     parts = [getattr(fine, part).detach() for part in Lobes.names()]
     lobes, values = by_strength(Lobes(*parts)), transfer.dense().flatten(1, 2)
     for curve, metric in (("codes, l2", Metric.l2(transfer)), ("codes, prior", judge.prior)):
-        for share in SHARES["zh"]:
+        for share in judge.shares:
             own, coding = coded(
                 lobes, values, share=share, metric=metric.in_float32(), order=fine.order
             )
@@ -242,7 +249,7 @@ def tensor_curves(judge: Judge, size: tuple[int, ...]) -> Iterator[tuple[str, Po
             half = ClusteredTensor(encoding.coded(), transfer.surface, model.shape)
             yield "16 bits", judge(name, half, _stored(half))
         error = 0.0 if model.statistics is None else model.statistics.squared_error
-        for share in SHARES["cta"]:
+        for share in judge.shares:
             coding = coding_for(encoding, error, share=share, metric=metric.in_float32())
             found = ClusteredTensor(encoding, transfer.surface, model.shape, coding)
             yield curve, judge(f"{name} share {share:g}", found, _stored(found))
