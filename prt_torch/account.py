@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch import evaluate, gallery, store
@@ -23,7 +22,6 @@ from prt_torch.representations import (
 from prt_torch.representations.cpca_relabel import coherence
 from prt_torch.settings import PreviewConfig
 from prt_torch.solves import Fitted, Solve
-from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
 PICTURES = "pictures"  # folder of them inside a run folder
@@ -47,7 +45,7 @@ def write_report(
     relighters = {one.name: Relighter(one.representation).eval() for one in fitted}
     projected = [inputs.light_basis.project(light).float() for light in inputs.test_lights]
     camera = Camera.framing(inputs.mesh, aspect=preview.width / preview.height)
-    views = _eyes(camera) if transfer.surface.exit_basis.view_dependent else None
+    views = camera.around(_VIEWS) if transfer.surface.exit_basis.view_dependent else None
     lit, radiance_errors = [], {one.name: {} for one in fitted}
     for environment, light in zip(inputs.test_lights, projected, strict=True):
         shown, lost = _relight(relighters, transfer, light, views)
@@ -71,7 +69,7 @@ def write_report(
         height=preview.height,
         opengl=preview.opengl,
     )
-    report = _facts(inputs, transfer)
+    report = facts(inputs, transfer)
     report["left_out"] = _left_out(inputs, transfer, opengl_missing=not opengl_drew)
     report["left_out"] += _left_out_segments(transfer, fitted)
     report["solves"] = [solve.entry() for solve in solved]
@@ -106,13 +104,6 @@ def write_report(
     store.write_json(out / "report.json", report)
     write_html(out / "report.html", report, pictures)
     return report
-
-
-def _eyes(camera: Camera) -> Float[Tensor, "views 3"]:
-    """Where viewers stand: at the camera, and at equal steps around what it looks at."""
-    eye, target = torch.tensor(camera.eye), torch.tensor(camera.target)
-    steps = [rotation_about_up(360.0 * turn / _VIEWS).to(eye) for turn in range(_VIEWS)]
-    return torch.stack([target + turn @ (eye - target) for turn in steps])
 
 
 @torch.no_grad()
@@ -150,8 +141,8 @@ def _time(
     return dict(zip(relighters, taken, strict=True)), dense_taken * factor, scaled
 
 
-def _facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
-    """Scene, light and bake of report.json."""
+def facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
+    """Scene, light and bake of a report."""
     mesh, made = inputs.mesh, transfer.provenance
     bounces = made.get("bounces", {})
     return {

@@ -22,8 +22,9 @@ import torch
 
 from prt_torch import evaluate
 from prt_torch.bases import SphericalHarmonics
+from prt_torch.construction import Parameters, Problem, closed_form
 from prt_torch.errors import InputError
-from prt_torch.nesting import Parameters, Problem, chains, closed_form, nested
+from prt_torch.nesting import chains, nested
 from prt_torch.relight import Relighter
 from prt_torch.representations import Representation
 from prt_torch.transfer import TransferTensor

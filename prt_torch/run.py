@@ -20,6 +20,7 @@ from prt_torch import store
 from prt_torch.account import PICTURES, write_report
 from prt_torch.assets import Mesh
 from prt_torch.baking import RESOLVED, bake
+from prt_torch.construction import Problem, closed_form
 from prt_torch.errors import InputError
 from prt_torch.fitting import construction_status, fit
 from prt_torch.gallery import file_name
@@ -30,20 +31,14 @@ from prt_torch.report import solves_table, summary_table
 from prt_torch.representations import (
     CPCA,
     Representation,
-    WaveletTransfer,
     load,
     save,
 )
 from prt_torch.representations.cpca_relabel import reclassified
-from prt_torch.representations.files import KINDS
 from prt_torch.settings import (
-    ClusteredTensorConfig,
     CPCAConfig,
     RepresentationConfig,
     RunConfig,
-    ScatteredSRBFConfig,
-    SegmentedCPCAConfig,
-    WaveletConfig,
 )
 from prt_torch.solves import Fitted, solves
 from prt_torch.transfer import TransferTensor
@@ -258,25 +253,20 @@ def _closed_form(
     metric: Metric,
 ) -> Representation:
     """A representation as its paper constructs it."""
-    common: dict[str, Any] = {
-        "metric": metric,
-        "generator": torch.Generator().manual_seed(config.seed),
-    }
-    options = wanted.model_dump(exclude={"name"})
-    match wanted:
-        case CPCAConfig():
-            return _clustered(wanted, inputs, transfer, common)
-        case WaveletConfig():
-            return WaveletTransfer.from_transfer(transfer, **options)
-        case SegmentedCPCAConfig() | ClusteredTensorConfig() | ScatteredSRBFConfig():
-            common["memory_budget"] = config.memory_budget
-    return KINDS[wanted.name].from_transfer(transfer, **options, **common)
+    if isinstance(wanted, CPCAConfig):
+        return _clustered(wanted, config, inputs, transfer, metric)
+    problem = Problem(transfer, metric, config.seed, config.memory_budget)
+    return closed_form(problem, wanted.name, wanted.model_dump(exclude={"name"}))
 
 
 def _clustered(
-    wanted: CPCAConfig, inputs: Inputs, transfer: TransferTensor, common: dict[str, Any]
+    wanted: CPCAConfig, config: RunConfig, inputs: Inputs, transfer: TransferTensor, metric: Metric
 ) -> CPCA:
-    common = {"method": wanted.method, **common}
+    common: dict[str, Any] = {
+        "method": wanted.method,
+        "metric": metric,
+        "generator": torch.Generator().manual_seed(config.seed),
+    }
     if wanted.limits:
         model = CPCA.within(transfer, **wanted.limits, **common)
     else:
@@ -288,10 +278,10 @@ def _clustered(
             **common,
         )
     if wanted.reclassify:
-        faces, budget, metric = inputs.mesh.faces, wanted.reclassify, common["metric"]
+        faces, budget = inputs.mesh.faces, wanted.reclassify
         model = reclassified(model, transfer, faces, budget=budget, metric=metric)
     share = wanted.quantisation_share
-    return model.coded(transfer, share=share, metric=common["metric"]) if share else model
+    return model.coded(transfer, share=share, metric=metric) if share else model
 
 
 def _fit_one(

@@ -11,7 +11,7 @@ from prt_torch import InputError, TransferTensor, bake, evaluate
 from prt_torch.assets import concatenate, ground_plane, mesh_from_arrays
 from prt_torch.bases import CubeDirections, SphericalHarmonics
 from prt_torch.budget import Limits, choose, coarse, coarse_grids, refine
-from prt_torch.nesting import Problem, closed_form
+from prt_torch.construction import Problem, closed_form
 
 GRIDS = {
     "cpca": {"num_clusters": [2, 6, 16], "rank": [1, 2, 4]},

@@ -15,8 +15,9 @@ from rich.console import Console
 
 from prt_torch import InputError, TransferTensor, evaluate, store, sweep
 from prt_torch.bases import Haar, SphericalHarmonics
+from prt_torch.construction import Problem, closed_form
 from prt_torch.metric import Metric
-from prt_torch.nesting import NESTINGS, Chain, Problem, chains, closed_form, nested
+from prt_torch.nesting import NESTINGS, Chain, chains, nested
 from prt_torch.reductions import (
     fewer_functions,
     fewer_segment_vectors,

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
+from torch import Tensor
 
 from prt_torch.assets.mesh import Mesh
+from prt_torch.sphere import rotation_about_up
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,12 @@ class Camera:
             target=_triple(target),
             vertical_fov_degrees=vertical_fov_degrees,
         )
+
+    def around(self, count: int) -> Float[Tensor, "count 3"]:
+        """Where this camera and others at equal steps around what it looks at stand."""
+        eye, target = torch.tensor(self.eye), torch.tensor(self.target)
+        turns = [rotation_about_up(360.0 * turn / count).to(eye) for turn in range(count)]
+        return torch.stack([target + turn @ (eye - target) for turn in turns])
 
     def axes(self) -> Float64[np.ndarray, "3 3"]:
         """Rows: right, up and backwards in world coordinates.

@@ -39,7 +39,8 @@ from prt_torch.report.outcome import (
 from prt_torch.report.plots import DARK, LIGHT, error_against_bytes, error_against_time
 from prt_torch.report.style import SORTING, STYLE
 
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+"""What a page may load: nothing that is not in it."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def write_html(path: Path, report: Mapping[str, Any], pictures: Sequence[Picture
         _summary(report, rows),
         _results(rows),
         _plots(report),
-        _pictures(pictures),
+        pictures_section(pictures),
         _left_out(report.get("left_out") or []),
         _endings(endings(report)),
     ]
@@ -89,7 +90,7 @@ def write_html(path: Path, report: Mapping[str, Any], pictures: Sequence[Picture
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <title>{title} – transfer report</title>
 <style>{STYLE}</style>
 </head>
@@ -323,7 +324,8 @@ def _data(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
-def _pictures(pictures: Sequence[Picture]) -> str:
+def pictures_section(pictures: Sequence[Picture]) -> str:
+    """Pictures in their groups, as a section of a page; nothing where there are none."""
     if not pictures:
         return ""
     groups = "".join(

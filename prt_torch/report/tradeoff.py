@@ -11,9 +11,7 @@ from typing import Any
 
 from prt_torch import store
 from prt_torch.report.numbers import bytes_text, error_text, percent_text, seconds_text
-from prt_torch.report.page import _POLICY as POLICY
-from prt_torch.report.page import Picture
-from prt_torch.report.page import _pictures as pictures_section
+from prt_torch.report.page import POLICY, Picture, pictures_section
 from prt_torch.report.style import SORTING, STYLE
 from prt_torch.report.tradeoff_svg import TELLING, bars, family_style, legend, plot, told
 from prt_torch.tradeoff import COSTS, ERRORS, Stage, error_of, fronts

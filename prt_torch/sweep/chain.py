@@ -15,10 +15,11 @@ import torch
 from rich.console import Console
 
 from prt_torch import store
+from prt_torch.construction import Parameters, Problem
 from prt_torch.errors import InputError
 from prt_torch.inputs import Inputs, load_inputs
 from prt_torch.metric import Metric
-from prt_torch.nesting import Chain, Made, Parameters, Problem, nested
+from prt_torch.nesting import Chain, Made, nested
 from prt_torch.representations import Representation, load, save
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.run import bake_only

@@ -23,11 +23,13 @@ from rich.table import Table
 from rich.text import Text
 
 from prt_torch import store
+from prt_torch.account import facts
 from prt_torch.budget import Choice, Limits, Tried, refine
+from prt_torch.construction import Problem
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
 from prt_torch.inputs import Inputs
-from prt_torch.nesting import Chain, Problem, chains
+from prt_torch.nesting import Chain, chains
 from prt_torch.report import summary_table
 from prt_torch.report.numbers import bytes_text, error_text, percent_text, seconds_text
 from prt_torch.report.tradeoff import write_tradeoff
@@ -287,7 +289,7 @@ def _gather(
                 store.write_json(path, times)
                 last = time.monotonic()
     store.write_json(path, times)
-    return {**_facts(inputs, judge.transfer), "left_out": [], "failed": failed, "results": results}
+    return {**facts(inputs, judge.transfer), "left_out": [], "failed": failed, "results": results}
 
 
 def _result(
@@ -302,26 +304,4 @@ def _result(
         "view_seconds": own["cpu"]["view"],
         "dense_seconds": times["dense"]["both"],
         **{f"{device}_seconds": own[device] for device in devices if device != "cpu"},
-    }
-
-
-def _facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
-    """Scene, light and bake of the report."""
-    mesh, made = inputs.mesh, transfer.provenance
-    return {
-        "scene": {
-            "mesh": mesh.name,
-            "points": mesh.num_points,
-            "faces": mesh.num_faces,
-            "material": inputs.material,
-            "rows": transfer.num_rows,
-            "channels": transfer.num_channels,
-        },
-        "light": {"basis": inputs.light_basis.name, "coeffs": transfer.num_coeffs},
-        "bake": {
-            "seconds": made["visibility_seconds"] + made["projection_seconds"],
-            "rays": made["rays"],
-            "cached": made["visibility_cached"] and made["projection_cached"],
-        },
-        "raw_bytes": transfer.num_bytes,
     }

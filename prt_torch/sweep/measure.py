@@ -13,15 +13,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from prt_torch import evaluate
-from prt_torch.assets import Mesh
 from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.representations import DenseTransfer, Representation
-from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
-_VIEWS = 6  # around the scene
+VIEWS = 6
+"""Around the scene."""
 _DENSE_BLOCK_POINTS = 2000  # timed and scaled up where the whole tensor would not fit
 _ROUNDS, _WARM_UP = 9, 2
 
@@ -50,7 +49,7 @@ class Judge:
     def of_inputs(cls, inputs: Inputs, transfer: TransferTensor) -> "Judge":
         """With the held-out lights of a run, and viewers around its scene."""
         lights = {one.name: inputs.light_basis.project(one).float() for one in inputs.test_lights}
-        return cls(transfer, lights, viewers(inputs.mesh))
+        return cls(transfer, lights, Camera.framing(inputs.mesh).around(VIEWS))
 
     def _seen(self) -> Bool[Tensor, "views points 1"] | Float[Tensor, "1 1 1"]:
         if self.views is None:
@@ -116,11 +115,3 @@ class Judge:
         own = Judge(block, dict(list(self.lights.items())[:1]), self.views)
         taken = own.seconds(DenseTransfer.from_transfer(block))
         return {name: value * self.transfer.num_points / points for name, value in taken.items()}
-
-
-def viewers(mesh: Mesh, count: int = _VIEWS) -> Float[Tensor, "views 3"]:
-    """Where viewers stand: at the camera that frames a mesh, and at equal steps around it."""
-    camera = Camera.framing(mesh)
-    eye, target = torch.tensor(camera.eye), torch.tensor(camera.target)
-    turns = [rotation_about_up(360.0 * turn / count).to(eye) for turn in range(count)]
-    return torch.stack([target + turn @ (eye - target) for turn in turns])

@@ -22,12 +22,13 @@ from torch import Tensor
 from prt_torch import evaluate
 from prt_torch.baking import bake
 from prt_torch.bases import CubeDirections
+from prt_torch.construction import Parameters, Problem, closed_form
 from prt_torch.inputs import Inputs
-from prt_torch.nesting import Parameters, Problem, closed_form
+from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.representations import Representation
 from prt_torch.settings import RunConfig
-from prt_torch.sweep.measure import viewers
+from prt_torch.sweep.measure import VIEWS
 from prt_torch.tradeoff import Stage, waterfall
 from prt_torch.transfer import TransferTensor, project
 from prt_torch.truncation import truncate
@@ -181,7 +182,7 @@ class _Scene:
             raise ValueError("expected transfer with a light basis, got none")
         views, seen = None, torch.ones(1, 1, 1)
         if surface.exit_basis.view_dependent:
-            views = viewers(self.inputs.mesh)
+            views = Camera.framing(self.inputs.mesh).around(VIEWS)
             seen = evaluate.seen_from(surface, views)[..., None]
         found = []
         for environment in self.inputs.test_lights:
