@@ -1,9 +1,8 @@
 """One near-lossless projection of all points, found by reading them a few times.
 
-The directions of most energy are eigenvectors of the second moment of the values. Where points have
-thousands of values it is never formed: orthogonal iteration on it, from random directions, needs
-products with the points only. Directions are handled in tiles of rows, so that they may lie in a
-file where they do not fit in memory.
+Orthogonal iteration on the second moment of the values, from random directions: the directions of
+most energy, without ever forming the moment. Directions are handled in tiles of rows, so that they
+may lie in a file where they do not fit in memory.
 
 Source:
     Halko, Martinsson, Tropp 2011, "Finding structure with randomness", algorithm 4.4.
@@ -17,21 +16,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from prt_torch.metric import Metric
-from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.exact_sums import ExactProducts
 from prt_torch.representations.points import Points, slices
 from prt_torch.representations.processes import ALONE, Processes
 from prt_torch.representations.scratch import Memory, ScratchRows
-from prt_torch.representations.steady import laid_out, steady_product
+from prt_torch.representations.steady import steady_product
 from prt_torch.representations.whitening import whitening
 from prt_torch.transfer import TransferTensor
 
 _STEPS = 2  # the third lowered what is lost by 4 % on glossy transfer, from 4e-5 of the energy
 _TILE = 1024  # rows of the directions
-
-MOMENT_SIZE = 1024
-"""Values of a point up to which their second moment is formed."""
-
 Blocks = Callable[[], Iterator[tuple[slice, Tensor]]]
 """Reads ranges of rows with their values, ``"some values"``, from the first to the last."""
 
@@ -75,8 +69,7 @@ def project(
     """Points in at most so many dimensions.
 
     Args:
-        transfer: Read once where it has no more values a point, three times up to
-            ``MOMENT_SIZE`` of them, else eight times or more.
+        transfer: Read once where it has no more values a point, else six times or more.
         metric: What weighs it.
         dimensions: At most.
         generator: Source of the first directions.
@@ -93,19 +86,7 @@ def project(
             found[rows] = values
         return Projected(points, None)
 
-    def blocks() -> Iterator[tuple[slice, Tensor]]:
-        return weighed_blocks(transfer, metric, memory)
-
-    if size > MOMENT_SIZE:
-        return Projected(points, directions(blocks, size, points, generator))
-    largest = _largest(blocks, size, points)
-    moment = ExactProducts(largest, largest, points.total, processes)
-    for _, values in blocks():
-        moment.add(values, values)
-    with one_thread():
-        axes = torch.linalg.eigh(moment.value())[1]
-    lift = laid_out(axes[:, -dimensions:].flip(1).to(like))
-    _products(blocks, lift, points)
+    lift = directions(lambda: weighed_blocks(transfer, metric, memory), size, points, generator)
     return Projected(points, lift)
 
 
@@ -125,7 +106,10 @@ def directions(
     for rows in _tiles(lift):
         first = torch.randn(rows.stop - rows.start, width, generator=generator)
         lift[rows] = first.to(points.like)
-    largest = _largest(blocks, size, points)
+    largest = points.like.new_zeros(size)
+    for _, values in blocks():
+        torch.maximum(largest, values.abs().amax(0), out=largest)
+    largest = points.processes.largest(largest)
     images = memory.empty((size, width), points.like.double())
     for _ in range(_STEPS):
         _products(blocks, lift, points)
@@ -133,14 +117,6 @@ def directions(
         _orthonormalise(images, lift)
     _products(blocks, lift, points)
     return lift
-
-
-def _largest(blocks: Blocks, size: int, points: Points) -> Float[Tensor, "values"]:
-    """Largest magnitude of each value over the rows of all processes."""
-    largest = points.like.new_zeros(size)
-    for _, values in blocks():
-        torch.maximum(largest, values.abs().amax(0), out=largest)
-    return points.processes.largest(largest)
 
 
 def _tiles(rows: Tensor | ScratchRows) -> Iterator[slice]:

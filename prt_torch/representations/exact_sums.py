@@ -26,6 +26,7 @@ from prt_torch.representations.processes import Processes
 _EXACT = 53  # bits of whole numbers in float64
 _LEAST_EXPONENT = -100  # of the largest: a unit of less has no inverse in float32
 _ROWS = 512  # that are converted together, so that they stay in cache
+_TABLE = 2**17  # elements of a product
 _LIMBS = {torch.float64: 3}  # that hold all digits; of other types, one
 
 
@@ -97,14 +98,14 @@ class ExactProducts:
             second = first if left is right else self._limbs(others, self._right)
             for place, total in enumerate(self._sums):
                 for limb in range(place + 1):
-                    total += (first[limb].mT @ second[place - limb]).long()
+                    _add_product(total, first[limb], second[place - limb])
 
     def value(self) -> Float[Tensor, "a b"]:
         """The sum over all processes, float64."""
         total = torch.zeros_like(self._sums[0], dtype=torch.float64)
-        for own in self._processes.sum(self._sums).flip(0):  # the smallest first
-            total = total / 2**self._fixed.bits + own
-        return total * self._left[:, None] * self._right
+        for own in reversed(self._processes.sum(self._sums).unbind()):  # the smallest first
+            total.div_(2**self._fixed.bits).add_(own)
+        return total.mul_(self._left[:, None]).mul_(self._right)
 
 
 class ExactClusterProducts:
@@ -150,6 +151,13 @@ class ExactClusterProducts:
         """The sum over all processes, float64."""
         total = self._processes.sum(self._sum).double()
         return total * self._left[:, :, None] * self._right[:, None]
+
+
+def _add_product(total: Tensor, left: Tensor, right: Tensor) -> None:
+    """Add ``left^T right`` to whole numbers, a few rows at a time, as products take memory too."""
+    most = max(1, _TABLE // total.shape[1])
+    for rows, columns in zip(total.split(most), left.split(most, dim=1), strict=True):
+        rows += (columns.mT @ right).long()
 
 
 def _product(

@@ -19,9 +19,9 @@ from prt_torch.representations.steady import STEADY_ROWS
 # Shares of the memory that is free. Together they leave a third of it: what is freed between other
 # things is not given back to the system.
 _CHUNK_SHARE = 40  # 16 copies of a chunk may be alive at once
-_BLOCK_SHARE = 16  # reading takes a block three times over
-_TABLE_SHARE = 8
-_RESIDENT_SHARE = 8  # of one set of values of all points, which is kept in a file if it is larger
+_BLOCK_SHARE = 32  # reading takes a block three times over
+_TABLE_SHARE = 12
+_RESIDENT_SHARE = 12  # of one set of values of all points, which is kept in a file if it is larger
 
 _BLOCK_BYTES = 2**26  # of values that are read together at most
 _LEAST_CHUNK = 2**15  # bytes; smaller ones would take hours
@@ -130,10 +130,11 @@ class Memory:
         return self.budget is None or nbytes <= self._free // 2
 
     def rows_at_once(self, row_bytes: int) -> int | None:
-        """Rows of a chunk."""
+        """Rows of a chunk: a whole number of steady blocks, unless these are too large."""
         if self.chunk_bytes is None:
             return None
-        return max(1, self.chunk_bytes // row_bytes // STEADY_ROWS) * STEADY_ROWS
+        rows = self.chunk_bytes // row_bytes
+        return max(1, rows if rows < STEADY_ROWS else rows // STEADY_ROWS * STEADY_ROWS)
 
     def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor | ScratchRows:
         """Room for rows, in memory if they are a small part of what is free."""
