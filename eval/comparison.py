@@ -27,7 +27,7 @@ from prt_torch.command import main
 from prt_torch.errors import InputError
 from prt_torch.report.numbers import bytes_text, percent_text, seconds_text
 from prt_torch.report.plots import LIGHT
-from prt_torch.tradeoff import Result, error_of, fronts, within
+from prt_torch.tradeoff import Result, error_of, front, within
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 ERROR = "mean_radiance_error"
@@ -51,11 +51,11 @@ class Part:
 
 
 PARTS = (
-    Part("diffuse", ("sweep=comparison",), (1 / 8, 1 / 4, 1 / 2)),
+    Part("diffuse", ("sweep=comparison",), (1 / 32, 1 / 8, 1 / 2)),
     Part(
         "glossy",
         ("sweep=comparison_glossy", "material=glossy", "transfer=sh_factors", "transfer.order=5"),
-        (1 / 32, 1 / 16, 1 / 8),
+        (1 / 64, 1 / 16, 1 / 4),
     ),
 )
 
@@ -96,9 +96,7 @@ def _table(part: Part, report: dict[str, Any]) -> str:
         f"| representation | {' | '.join(heads)} | change of light | fit |",
         f"| --- |{' --- |' * (len(heads) + 2)}",
     ]
-    families = dict.fromkeys(str(one["representation"]) for one in report["results"])
-    for family in families:
-        own = [one for one in report["results"] if one["representation"] == family]
+    for family, own in _families(report["results"]).items():
         found = [within(own, {"bytes": limit}, _error) for limit in budgets]
         largest = next((one for one in reversed(found) if one), None)
         if largest is None:
@@ -111,13 +109,24 @@ def _table(part: Part, report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _families(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Results by kind, those in compressed codes apart."""
+    found: dict[str, list[Result]] = {}
+    for one in results:
+        coded = one["parameters"].get("quantisation_share") is not None
+        name = f"{one['representation']}{', compressed' if coded else ''}"
+        found.setdefault(name, []).append(one)
+    return found
+
+
 def _error(result: Result) -> float:
     return error_of(result, ERROR) or 0.0
 
 
 def _size(result: Result) -> str:
     """What is left of a name without that of its kind."""
-    return str(result["name"]).removeprefix(str(result["representation"])).strip()
+    name = str(result["name"]).removeprefix(str(result["representation"]))
+    return name.partition(" coded")[0].strip()
 
 
 def _plots(reports: Sequence[dict[str, Any]]) -> bytes:
@@ -138,14 +147,17 @@ def _plots(reports: Sequence[dict[str, Any]]) -> bytes:
 
 def _draw(axes: Axes, results: Sequence[Result], cost: str) -> None:
     """The fronts of all families."""
-    chosen = fronts(results, cost, ERROR)
-    families = dict.fromkeys(str(one["representation"]) for one in results)
-    for place, family in enumerate(families):
-        own = sorted(
-            (float(one[cost]), _error(one)) for one in results if one["name"] in chosen[family]
+    kinds = list(dict.fromkeys(str(one["representation"]) for one in results))
+    for family, own in _families(results).items():
+        points = [(float(one[cost]), _error(one)) for one in own]
+        place = kinds.index(str(own[0]["representation"]))
+        axes.loglog(
+            *zip(*(points[kept] for kept in front(points)), strict=True),
+            color=LIGHT.families[place],
+            marker=_MARKERS[place],
+            linestyle="--" if family not in kinds else "-",
+            label=family,
         )
-        colour, marker = LIGHT.families[place], _MARKERS[place]
-        axes.loglog(*zip(*own, strict=True), color=colour, marker=marker, label=family)
     axes.grid(color=LIGHT.grid)
 
 
