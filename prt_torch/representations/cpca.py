@@ -374,7 +374,9 @@ class CPCA(CodedRepresentation):
     ) -> "CPCA":
         """The inverse of :meth:`packed`."""
         encoding, coding = unpack(packed, surface, shape)
-        return cls(encoding, surface, shape, coding)
+        model = cls(encoding, surface, shape, coding)
+        model._layout = VectorLayout(model.labels, model.ranks, model.affine)  # as after a fit
+        return model
 
     @property
     def budget(self) -> dict[str, Any]:
