@@ -374,9 +374,7 @@ class CPCA(CodedRepresentation):
     ) -> "CPCA":
         """The inverse of :meth:`packed`."""
         encoding, coding = unpack(packed, surface, shape)
-        model = cls(encoding, surface, shape, coding)
-        model._layout = VectorLayout(model.labels, model.ranks, model.affine)  # as after a fit
-        return model
+        return cls(encoding, surface, shape, coding)
 
     @property
     def budget(self) -> dict[str, Any]:
