@@ -2,7 +2,7 @@
 
 python eval/radiance_metric.py [--mesh=FILE] [--material=diffuse|glossy] [--method=cpca|zh|cta]
                                [--lights=FOLDER] [--supersampling=N] [--cache=FOLDER]
-                               [--points=N] [--short]
+                               [--points=N] [--shrinkage=S] [--short]
 
 The baseline is each paper's closed form at the L2 metric, every number in 16 bits, over a grid of
 sizes. Beside it stand the same sizes in compressed codes, at L2 and under a prior of seven measured
@@ -14,7 +14,8 @@ Diffuse transfer is of order 6; glossy transfer is Cook-Torrance in 24 rows by o
 A ratio is bytes over those of the baseline at equal error, interpolated between the sizes of its
 front (log over log). The floor is reverse water-filling over the covariance of each cluster: the
 bits without which weights cannot have the error, whatever codes they are in. --points
-keeps so many points, evenly picked; --short takes a third of the grid.
+keeps so many points, evenly picked; --shrinkage is that of the prior; --short takes a third of the
+grid.
 """
 
 import itertools
@@ -112,9 +113,12 @@ class Judge:
         transfer: The tensor.
         lights: Folder of environments.
         shares: Of squared error, that codes may add.
+        shrinkage: Of the prior.
     """
 
-    def __init__(self, transfer: TransferTensor, lights: Path, shares: Sequence[float]):
+    def __init__(
+        self, transfer: TransferTensor, lights: Path, shares: Sequence[float], shrinkage: float
+    ):
         basis = transfer.surface.light_basis
         if not isinstance(basis, SphericalHarmonics):
             raise ValueError("expected transfer in spherical harmonics")
@@ -122,7 +126,7 @@ class Judge:
         self._rows = Metric("l2", None, transfer.surface.exit_basis.gram_root())
         fitted = self._project(lights, FITTED)
         exit_basis = transfer.surface.exit_basis
-        self.prior = Metric.light_prior(fitted, basis, exit_basis=exit_basis)
+        self.prior = Metric.light_prior(fitted, basis, exit_basis=exit_basis, shrinkage=shrinkage)
         held_out = self._project(lights, HELD_OUT)
         turned = [basis.rotate(held_out, rotation_about_up(turn)) for turn in TURNS]
         generator = torch.Generator().manual_seed(5)
@@ -162,7 +166,7 @@ def _of_one_power(
 def compare(arguments: list[str]) -> None:
     """Print the curves and the ratios."""
     options = {"mesh": "", "material": "diffuse", "method": "cpca", "supersampling": "2"}
-    options |= {"cache": ".cache/bakes", "lights": "", "points": "0"}
+    options |= {"cache": ".cache/bakes", "lights": "", "points": "0", "shrinkage": "0.5"}
     short = "--short" in arguments
     for argument in arguments:
         name, _, value = argument.removeprefix("--").partition("=")
@@ -182,7 +186,8 @@ def compare(arguments: list[str]) -> None:
     else:
         transfer = bake(mesh, **baking)
     transfer = _some_points(transfer, int(options["points"]))
-    judge = Judge(transfer, Path(options["lights"] or assets / "env"), SHARES[method, material])
+    lights, shares = Path(options["lights"] or assets / "env"), SHARES[method, material]
+    judge = Judge(transfer, lights, shares, float(options["shrinkage"]))
     sizes = SIZES[method, material]
     shape = tuple(judge.transfer.values.shape)
     print(f"{mesh.name}, {material}, {method}: {shape}\n", flush=True)
