@@ -47,6 +47,8 @@ from prt_torch.representations.processes import Processes
 from prt_torch.representations.products import matmul_few
 from prt_torch.transfer import Surface, TransferTensor
 
+_TABLE_BYTES = 32  # a point, of tables for evaluation
+
 
 class ClusteredTensor(CodedRepresentation):
     """Clusters of points with a Tucker decomposition each.
@@ -150,7 +152,8 @@ class ClusteredTensor(CodedRepresentation):
                 (``TMPDIR``) and read in chunks, which takes longer and changes the result by
                 rounding only; where even tables of all clusters are large beside it, fewer light
                 axes are kept than the error asks for, and ``statistics.projection_lost`` says what
-                that costs. Tables for fast evaluation are made at the first call, outside of it.
+                that costs. Where it is short,
+                tables for fast evaluation are made at the first call, outside of it.
             process_group: Processes that share the work, each with points of its own, in order of
                 rank; every process makes this call with the same options. The result has all
                 clusters and this process's points (:meth:`gathered` makes one of all), and the
@@ -200,6 +203,8 @@ class ClusteredTensor(CodedRepresentation):
             encoding = encoding.coded(processes)
         found = cls(encoding, transfer.surface, tuple(transfer.values.shape), coding)
         found.statistics = statistics
+        if len(found.labels) * _TABLE_BYTES <= memory_budget // 16:
+            found._blocks = ClusterBlocks(found.labels, found.num_clusters)
         return found
 
     def _rounded(self) -> dict[str, Tensor]:
@@ -353,10 +358,13 @@ class ClusteredTensor(CodedRepresentation):
         cls, packed: dict[str, Tensor], surface: Surface, shape: tuple[int, int, int, int]
     ) -> "ClusteredTensor":
         """The inverse of :meth:`packed`."""
-        if "weight_stream" not in packed:
-            return cls(unpack(packed), surface, shape)
-        encoding, coding = decompressed(packed, shape[0], shape[3], surface.light_basis)
-        return cls(encoding, surface, shape, coding)
+        if "weight_stream" in packed:
+            encoding, coding = decompressed(packed, shape[0], shape[3], surface.light_basis)
+        else:
+            encoding, coding = unpack(packed), None
+        found = cls(encoding, surface, shape, coding)
+        found._blocks = ClusterBlocks(found.labels, found.num_clusters)
+        return found
 
     def coherence(self, faces: Int[Tensor, "faces 3"]) -> dict[str, float]:
         """How often a face is drawn (:func:`prt_torch.representations.coherence.draws`).
