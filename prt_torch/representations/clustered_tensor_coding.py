@@ -22,7 +22,7 @@ from prt_torch.quantize import (
     rounded_up,
     straight_through,
 )
-from prt_torch.representations.points import slices
+from prt_torch.representations.points import SLICE, slices
 from prt_torch.representations.processes import ALONE, Processes
 from prt_torch.representations.segmented_quantisation import weight_steps
 
@@ -70,7 +70,7 @@ class Steps:
         """The finest at which no value is clamped, whatever process it is on."""
         clusters, rank = parameters.cores.shape[:2]
         largest = parameters.weights.new_zeros(clusters, rank)
-        for some in slices(len(labels)):
+        for some in slices(len(labels), max(1, SLICE // rank)):
             magnitudes = parameters.weights[some].abs()
             entries = labels[some, None].expand(-1, rank)
             largest.scatter_reduce_(0, entries, magnitudes, "amax")
@@ -129,7 +129,7 @@ class Encoding:
         steps, own = self.steps, self.parameters
         if steps is None:
             return self
-        for some in slices(len(weights)):
+        for some in slices(len(weights), max(1, SLICE // weights.shape[1])):
             weights[some] = _at_multiples(own.weights[some], steps.weights[self.labels[some]])
         values = {
             name: _at_multiples(getattr(own, name), getattr(steps, name))
