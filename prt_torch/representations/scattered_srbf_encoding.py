@@ -40,6 +40,7 @@ from prt_torch.representations.clustered_tensor_projection import (
 from prt_torch.representations.cpca_clusters import cluster_means, refill, vector_quantise
 from prt_torch.representations.cpca_subspaces import one_thread, principal
 from prt_torch.representations.grouped import sort_labels
+from prt_torch.representations.magnitude import of_ordinary_magnitude
 from prt_torch.representations.scattered_srbf_coding import (
     Parameters,
     ScatteredEncoding,
@@ -85,6 +86,7 @@ def encode(
         InputError: If the fit of one cluster would take more than ``memory_budget``.
     """
     clusters_at_once = _affordable(num_functions, resolution, memory_budget)
+    transfer, power = of_ordinary_magnitude(transfer)
     moments = read_moments(transfer, metric)
     found = project(
         transfer,
@@ -113,7 +115,7 @@ def encode(
         centers, log_bandwidths = rounded_functions(centers, log_bandwidths)
     expanded = in_light_basis(basis, centers.double(), log_bandwidths.double(), resolution)
     weights, condition = _solve(expanded, transfer, labels, metric, dtype)
-    parameters = Parameters(centers, log_bandwidths, weights)
+    parameters = Parameters(centers, log_bandwidths, weights.div_(power))
     encoding = ScatteredEncoding(labels, parameters, None, resolution, condition)
     return encoding.coded() if coded else encoding
 
