@@ -124,7 +124,7 @@ class ExactClusterProducts:
         self._left, self._right = like.new_zeros(clusters, left), like.new_zeros(clusters, right)
         self._sum = like.new_zeros(shape, dtype=torch.int64)
 
-    def look(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots columns"]) -> None:
+    def look(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots _"]) -> None:
         """Some points' values of both kinds, to find the largest of each cluster and column."""
         for largest, own in zip((self._left, self._right), values, strict=True):
             found = torch.cat([rows.abs().amax(1) for _, (rows,) in blocks.runs(own)])
@@ -136,7 +136,7 @@ class ExactClusterProducts:
             self._fixed.step(self._processes.largest(one)) for one in (self._left, self._right)
         )
 
-    def add(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots columns"]) -> None:
+    def add(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots _"]) -> None:
         """The same values again, to be added."""
         steps = (self._left, self._right)
         left, right = (blocks.by_size(1.0 / step)[:, None].to(values[0]) for step in steps)

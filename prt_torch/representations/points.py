@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from prt_torch.representations.exact_sums import ExactClusterProducts
@@ -311,7 +311,7 @@ def cluster_sums(
     return processes.sum(total)
 
 
-def total_of(values: Float[Tensor, "points"], processes: Processes = ALONE) -> float:
+def total_of(values: Shaped[Tensor, "points"], processes: Processes = ALONE) -> float:
     """Sum of a number of each point, in float64."""
     local = values.sum(dtype=torch.float64)
     return float(processes.sum(local))
