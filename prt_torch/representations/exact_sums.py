@@ -56,7 +56,7 @@ class FixedPoint:
         return torch.ldexp(torch.ones_like(exponents, dtype=torch.float64), exponents)
 
     @staticmethod
-    def units(values: Float[Tensor, "*some"], per_step: Float[Tensor, "*some"]) -> Tensor:
+    def units(values: Float[Tensor, "*#some"], per_step: Float[Tensor, "*#some"]) -> Tensor:
         """Whole numbers of steps, float64; ``per_step`` are the inverses, in the type of values."""
         return values.mul(per_step).round_().double()
 

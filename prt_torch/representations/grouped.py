@@ -132,7 +132,7 @@ class ClusterBlocks(nn.Module):
         ]
 
     def runs(
-        self, *values: Shaped[Tensor, "slots *rest"], most: int = _RUN_ELEMENTS
+        self, *values: Shaped[Tensor, "slots ..."], most: int = _RUN_ELEMENTS
     ) -> Iterator[tuple[slice, list[Tensor]]]:
         """A few clusters at a time, with views ``"some size *rest"`` of their slots.
 

@@ -33,7 +33,7 @@ class Processes:
         self.count = 1 if group is None else distributed.get_world_size(group)
         self.rank = 0 if group is None else distributed.get_rank(group)
 
-    def sum(self, values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    def sum(self, values: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
         """Over all processes, in place where there are several; give float64."""
         if self.count > 1:
             distributed.all_reduce(values, group=self._group)
