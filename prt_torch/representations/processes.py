@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import torch
 import torch.distributed as distributed
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 from torch import Tensor
 
 from prt_torch.transfer import Surface
