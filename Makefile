@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
+# Two processes share two cores.
+test test-all test-types: export OMP_NUM_THREADS = 1
+
 .PHONY: demo test test-all test-types lint bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt

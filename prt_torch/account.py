@@ -20,6 +20,7 @@ from prt_torch.representations import (
     SegmentedCPCA,
 )
 from prt_torch.representations.cpca_relabel import coherence
+from prt_torch.representations.palette import reflectance_bytes
 from prt_torch.settings import PreviewConfig
 from prt_torch.solves import Fitted, Solve
 from prt_torch.transfer import TransferTensor
@@ -204,12 +205,17 @@ def _left_out(
                 "saved_bytes": values // _ALL_BUT_ONE,
             }
         )
-    if len(transfer.surface.reflectance) == 1:
+    reflectance = transfer.surface.reflectance
+    saved = 3 * mesh.num_points * reflectance.itemsize - reflectance_bytes(reflectance)
+    if saved:
+        shared = len(reflectance) == 1
         left_out.append(
             {
                 "what": "reflectance by point",
-                "why": "all points have the same",
-                "saved_bytes": 12 * (mesh.num_points - 1),
+                "why": "all points have the same"
+                if shared
+                else "a file keeps its few colours once",
+                "saved_bytes": saved,
             }
         )
     rays_traced = transfer.provenance["rays"]

@@ -19,9 +19,9 @@ from prt_torch.representations.cpca_encoding import Encoding
 from prt_torch.representations.cpca_relabel import ClusterErrors, with_labels
 from prt_torch.representations.cpca_search import (
     Shape,
+    StorageBytes,
     error_table,
     relative_error,
-    storage_bytes,
 )
 from prt_torch.transfer import TransferTensor
 
@@ -432,7 +432,7 @@ def test_the_table_of_one_cluster_is_pca_and_others_are_near_static_encodings():
         assert table[Shape(1, rank)] == pytest.approx(exact, rel=1e-6)
         static = CPCA.from_transfer(transfer, num_clusters=16, rank=rank, method="static")
         assert 0.4 < table[Shape(16, rank)] / error_of(static, transfer) < 2.5
-        assert storage_bytes(transfer, Shape(16, rank)) == num_bytes(static)
+        assert StorageBytes(transfer)(Shape(16, rank)) == num_bytes(static)
 
 
 @pytest.mark.parametrize("method", ["static", "iterative", "adaptive"])
@@ -458,7 +458,7 @@ def test_the_fewest_bytes_within_an_error(max_error):
     found = CPCA.within(transfer, max_error=max_error)
     assert error_of(found, transfer) <= max_error
     for clusters, rank in itertools.product((1, 4, 16, 64), (0, 1, 2, 4, 8)):
-        if storage_bytes(transfer, Shape(clusters, rank)) < 0.8 * num_bytes(found):
+        if StorageBytes(transfer)(Shape(clusters, rank)) < 0.8 * num_bytes(found):
             other = CPCA.from_transfer(transfer, num_clusters=clusters, rank=rank)
             assert error_of(other, transfer) > max_error
 

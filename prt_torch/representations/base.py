@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from prt_torch.metric import Metric
+from prt_torch.representations.palette import reflectance_bytes
 from prt_torch.transfer import Surface, TransferTensor
 
 
@@ -126,7 +127,7 @@ class Representation(nn.Module, ABC):
         parts = {name: tensor.nbytes for name, tensor in self.packed().items()}
         exit_bytes = sum(tensor.nbytes for tensor in self._surface.exit_basis.tensors().values())
         exits = {"exit_basis": exit_bytes} if exit_bytes else {}
-        return {**parts, "reflectance": self.reflectance.nbytes, **exits}
+        return {**parts, "reflectance": reflectance_bytes(self.reflectance), **exits}
 
     @property
     def shape(self) -> tuple[int, int, int, int]:

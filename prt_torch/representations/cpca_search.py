@@ -26,6 +26,7 @@ from prt_torch.representations.cpca_encoding import MAX_DIMENSIONS, Encoding
 from prt_torch.representations.cpca_projection import project, weighed_blocks
 from prt_torch.representations.cpca_subspaces import one_thread
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
+from prt_torch.representations.palette import reflectance_bytes
 from prt_torch.transfer import TransferTensor
 
 _MOST_CLUSTERS = 2048
@@ -97,25 +98,31 @@ def search(
     if max_error is not None:
         return _least_bytes(_between(table), attempts, max_error)
     if max_bytes is not None:
-        smallest = storage_bytes(transfer, Shape(1, 0))
-        inside = {
-            s: e for s, e in _between(table).items() if storage_bytes(transfer, s) <= max_bytes
-        }
+        storage = StorageBytes(transfer)
+        inside = {s: e for s, e in _between(table).items() if storage(s) <= max_bytes}
         if not inside:
+            smallest = storage(Shape(1, 0))
             raise InputError(f"max_bytes {max_bytes}: the smallest encoding takes {smallest}")
         return _least_error(inside, attempts)
     inside = _fast_enough(table, transfer, mock, float(max_relight_seconds or 0.0))
     return _least_error(inside, attempts)
 
 
-def storage_bytes(transfer: TransferTensor, shape: Shape) -> int:
-    """Bytes of an encoding of equal ranks: weights, representatives, labels, reflectance."""
-    values = transfer.num_channels * transfer.num_rows * transfer.num_coeffs
-    points, clusters, rank = transfer.num_points, shape.num_clusters, shape.rank
-    numbers = points * rank + clusters * (rank + 1) * values
-    label = 1 if clusters <= 2**8 else 2 if clusters <= 2**15 else 4
-    fixed = points * label + transfer.surface.reflectance.nbytes
-    return numbers * transfer.values.dtype.itemsize + fixed
+class StorageBytes:
+    """Bytes of encodings of equal ranks: weights, representatives, labels, reflectance."""
+
+    def __init__(self, transfer: TransferTensor):
+        self._points = transfer.num_points
+        self._values = transfer.num_channels * transfer.num_rows * transfer.num_coeffs
+        self._itemsize = transfer.values.dtype.itemsize
+        self._reflectance = reflectance_bytes(transfer.surface.reflectance)
+
+    def __call__(self, shape: Shape) -> int:
+        """Of an encoding of this shape."""
+        clusters, rank = shape.num_clusters, shape.rank
+        numbers = self._points * rank + clusters * (rank + 1) * self._values
+        label = 1 if clusters <= 2**8 else 2 if clusters <= 2**15 else 4
+        return numbers * self._itemsize + self._points * label + self._reflectance
 
 
 def error_table(
@@ -235,7 +242,7 @@ def _least_error(inside: dict[Shape, float], attempts: _Attempts[Model]) -> Mode
 
 def _least_bytes(table: dict[Shape, float], attempts: _Attempts[Model], max_error: float) -> Model:
     """The smallest encoding that keeps the error; each attempt corrects the estimates."""
-    transfer, ratio = attempts.transfer, 1.0
+    storage, ratio = StorageBytes(attempts.transfer), 1.0
     best: Model | None = None
     for turn in range(_ENCODINGS):
         most = math.inf if best is None else sum(best.storage().values())
@@ -244,7 +251,7 @@ def _least_bytes(table: dict[Shape, float], attempts: _Attempts[Model], max_erro
             shape
             for shape, error in table.items()
             if shape not in attempts
-            and storage_bytes(transfer, shape) < most
+            and storage(shape) < most
             and error * (ratio if shape.num_clusters > 1 else 1.0) * doubt <= max_error
             and not any(
                 shape.num_clusters <= seen.num_clusters and shape.rank <= seen.rank
@@ -255,9 +262,9 @@ def _least_bytes(table: dict[Shape, float], attempts: _Attempts[Model], max_erro
         if not options and best is not None:
             break
         if options:
-            shape = min(options, key=lambda shape: (storage_bytes(transfer, shape), shape))
+            shape = min(options, key=lambda shape: (storage(shape), shape))
         else:
-            shape = min(table, key=lambda shape: (table[shape], storage_bytes(transfer, shape)))
+            shape = min(table, key=lambda shape: (table[shape], storage(shape)))
         model, error = attempts[shape]
         if table[shape] > 0 and error > 0 and shape.num_clusters > 1:
             ratio = error / table[shape]
@@ -276,13 +283,13 @@ def _fast_enough(
     max_seconds: float,
 ) -> dict[Shape, float]:
     """For each number of clusters the largest rank that keeps the time, if any does."""
-    inside, fastest = {}, math.inf
+    storage, inside, fastest = StorageBytes(transfer), {}, math.inf
     for clusters in sorted({shape.num_clusters for shape in table}):
         ranks = [
             shape.rank
             for shape in table
             if shape.num_clusters == clusters
-            and (shape.rank == 0 or storage_bytes(transfer, shape) <= transfer.num_bytes)
+            and (shape.rank == 0 or storage(shape) <= transfer.num_bytes)
         ]
         low, high = 0, max(ranks) + 1  # the first rank not known to be fast, the first not to be
         while low < high:

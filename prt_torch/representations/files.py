@@ -1,8 +1,8 @@
 """Fitted representations as files.
 
-A file holds exactly what ``packed()`` gives, the reflectance, and in its header the shape, the
-bases and the kind. Beside it stands ``<name>.sha256`` in the format of the ``sha256sum`` tool;
-loading verifies it. Saving and loading are exact to the bit.
+A file holds exactly what ``packed()`` gives, the reflectance (``palette``), and in its header the
+shape, the bases and the kind. Beside it stands ``<name>.sha256`` in the format of the ``sha256sum``
+tool; loading verifies it. Saving and loading are exact to the bit.
 """
 
 from pathlib import Path
@@ -14,6 +14,7 @@ from prt_torch.representations.base import Representation
 from prt_torch.representations.clustered_tensor import ClusteredTensor
 from prt_torch.representations.cpca import CPCA
 from prt_torch.representations.dense import DenseTransfer
+from prt_torch.representations.palette import packed_reflectance, take_reflectance
 from prt_torch.representations.scattered_srbf import ScatteredSRBF
 from prt_torch.representations.segmented_cpca import SegmentedCPCA
 from prt_torch.representations.wavelet import WaveletTransfer
@@ -51,7 +52,7 @@ def save(representation: Representation, path: Path | str) -> None:
         "light_basis": surface.light_basis.describe() if surface.light_basis else None,
         "exit_basis": surface.exit_basis.describe(),
     }
-    tensors = {**representation.packed(), "reflectance": surface.reflectance}
+    tensors = {**representation.packed(), **packed_reflectance(surface.reflectance)}
     tensors |= {_EXIT + name: tensor for name, tensor in surface.exit_basis.tensors().items()}
     written = store.write_tensors(path, tensors, header)
     store.write_bytes(checksum_path(path), f"{written['sha256']}  {path.name}\n".encode())
@@ -84,14 +85,14 @@ def load(path: Path | str, *, geometry: Surface | None = None) -> Representation
         for name in list(tensors)
         if name.startswith(_EXIT)
     }
+    points, channels, rows, coeffs = header["shape"]
     surface = Surface(
         exit_basis=exit_basis(header["exit_basis"], of_exit),
         light_basis=light_basis(header["light_basis"]) if header["light_basis"] else None,
-        reflectance=tensors.pop("reflectance"),
+        reflectance=take_reflectance(tensors, points),
         frames=geometry.frames if geometry else None,
         positions=geometry.positions if geometry else None,
     )
-    points, channels, rows, coeffs = header["shape"]
     return KINDS[kind].from_packed(tensors, surface, (points, channels, rows, coeffs))
 
 

@@ -30,6 +30,7 @@ from prt_torch.assets.patches import PATCH_FRAME
 from prt_torch.assets.tangents import orthonormal_frames
 from prt_torch.bases import SphericalHarmonics, exit_basis, light_basis, sh, zonal
 from prt_torch.errors import InputError
+from prt_torch.representations.palette import packed_reflectance, take_reflectance
 from prt_torch.representations.texture_map import TexelGrid
 from prt_torch.representations.zonal_lobes import ZonalLobes
 from prt_torch.representations.zonal_lobes_coding import Lobes
@@ -194,7 +195,7 @@ class LobeTexture(nn.Module):
             InputError: If the folder cannot be written.
         """
         surface = self.texels.surface
-        tensors = {**self.texels.packed(), "reflectance": surface.reflectance}
+        tensors = {**self.texels.packed(), **packed_reflectance(surface.reflectance)}
         tensors |= {_EXIT + name: own for name, own in surface.exit_basis.tensors().items()}
         if surface.frames is not None:
             tensors["frames"] = surface.frames
@@ -225,13 +226,13 @@ class LobeTexture(nn.Module):
             raise InputError(f"{path}: its hash differs from the one recorded; it is damaged")
         own = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_EXIT)}
         of_exit = {name.removeprefix(_EXIT): values for name, values in own.items()}
+        points, channels, rows, coeffs = header["shape"]
         surface = Surface(
             exit_basis=exit_basis(header["exit_basis"], of_exit),
             light_basis=light_basis(header["light_basis"]),
-            reflectance=tensors.pop("reflectance"),
+            reflectance=take_reflectance(tensors, points),
             frames=tensors.pop("frames", None),
         )
-        points, channels, rows, coeffs = header["shape"]
         texels = ZonalLobes.from_packed(tensors, surface, (points, channels, rows, coeffs))
         high, wide, along_v, along_u = header["grid"]
         grid = TexelGrid(high, wide, (along_v, along_u))
