@@ -46,8 +46,10 @@ class Projected:
         """Vectors among the values, in their type."""
         if self.lift is None:
             return vectors
-        tiles = [vectors @ self.lift[rows].to(vectors).mT for rows in _tiles(self.lift)]
-        return torch.cat(tiles, dim=1)
+        out = vectors.new_empty(len(vectors), self.lift.shape[0])
+        for rows in _tiles(self.lift):
+            out[:, rows] = vectors @ self.lift[rows].to(vectors).mT
+        return out
 
 
 def weighed_blocks(
