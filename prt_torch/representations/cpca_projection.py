@@ -26,6 +26,7 @@ from prt_torch.transfer import TransferTensor
 
 _STEPS = 2  # the third lowered what is lost by 4 % on glossy transfer, from 4e-5 of the energy
 _TILE = 1024  # rows of the directions
+_ROWS = 64  # of values that are multiplied together at least
 Blocks = Callable[[], Iterator[tuple[slice, Tensor]]]
 """Reads ranges of rows with their values, ``"some values"``, from the first to the last."""
 
@@ -125,13 +126,35 @@ def _tiles(rows: Tensor | ScratchRows) -> Iterator[slice]:
     return slices(rows.shape[0], _TILE)
 
 
+def _columns(blocks: Blocks, some: slice) -> Iterator[tuple[slice, Float[Tensor, "rows some"]]]:
+    """Some columns of the values, of enough rows at a time where only few can be read together."""
+    first, held = 0, []
+    for rows, values in blocks():
+        own = values[:, some]
+        held.append(own if len(own) >= _ROWS else own.clone())  # all other columns may go
+        if rows.stop - first >= _ROWS:
+            yield slice(first, rows.stop), _joined(held)
+            first, held = rows.stop, []
+    if held:
+        yield slice(first, first + sum(map(len, held))), _joined(held)
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
 def _products(blocks: Blocks, lift: Tensor | ScratchRows, points: Points) -> None:
     """Write the rows' products with the directions to the points."""
-    for block, values in blocks():
-        total = values.new_zeros(len(values), lift.shape[1])
-        for rows in _tiles(lift):
-            total += steady_product(values[:, rows], lift[rows])
-        points.write(block, total)
+    size, width = lift.shape
+    table_bytes = points.memory.table_bytes
+    tiles = size if table_bytes is None else table_bytes // (points.like.itemsize * width * _TILE)
+    for some in slices(size, max(1, tiles) * _TILE):
+        held = lift[some]
+        for block, values in _columns(blocks, some):
+            total = points.rows[block] if some.start else values.new_zeros(len(values), width)
+            for tile in _tiles(held):
+                total += steady_product(values[:, tile], held[tile])
+            points.write(block, total)
 
 
 def _images(
@@ -146,8 +169,8 @@ def _images(
     at_once = size if table_bytes is None else max(1, table_bytes // (8 * width))
     for some in slices(size, at_once):
         total = ExactProducts(largest[some], right, points.total, points.processes)
-        for block, values in blocks():
-            total.add(values[:, some], points.rows[block])
+        for block, values in _columns(blocks, some):
+            total.add(values, points.rows[block])
         images[some] = total.value()
 
 
