@@ -173,9 +173,9 @@ class Subspaces:
             rows = chunk.slots[slots].unflatten(0, (len(candidates), -1))
             losses = self._losses(rows, candidates)
             if price is not None:
-                losses += price[candidates][:, None]
-            own[slots] = losses[..., 0].flatten()
-            least, place = losses[..., 1:].min(dim=2)
+                losses += price[candidates][:, :, None]
+            own[slots] = losses[:, 0].flatten()
+            least, place = losses[:, 1:].min(dim=1)
             other[slots] = least.flatten()
             rival[slots] = candidates.gather(1, place + 1).flatten()
         return own, other, rival
@@ -197,19 +197,20 @@ class Subspaces:
         self,
         rows: Float[Tensor, "clusters size d"],
         candidates: Int[Tensor, "clusters c"],
-    ) -> Float[Tensor, "clusters size c"]:
+    ) -> Float[Tensor, "clusters c size"]:
         """Squared error of each point in each candidate cluster, its own first, less its spread.
 
         With y the point less its own mean, δ the candidate's mean less its own, v the candidate's
         vectors: ``|y-δ|² - Σ (y·v - δ·v)² = |y|² - 2 y·δ + |δ|² - Σ (y·v - δ·v)²``.
         """
-        shift = (self.means[candidates] - self.means[candidates[:, :1]]).mT  # clusters d c
-        vectors = self.vectors[candidates].permute(0, 2, 3, 1)  # clusters d rank c
-        offsets = -(vectors * shift[:, :, None]).sum(1).flatten(1)
-        explained = torch.baddbmm(offsets[:, None], rows, vectors.flatten(2))
-        explained = explained.unflatten(2, vectors.shape[2:]).square_().sum(2)
-        lengths = shift.square().sum(1)[:, None]
-        return torch.baddbmm(lengths, rows, shift, alpha=-2.0).sub_(explained)
+        # Points go last: products and minima run along them, in three quarters of the time.
+        shift = self.means[candidates] - self.means[candidates[:, :1]]  # clusters c d
+        vectors = self.vectors.mT[candidates]  # clusters c rank d
+        offsets = -(vectors @ shift[..., None]).flatten(1, 2)
+        explained = torch.baddbmm(offsets, vectors.flatten(1, 2), rows.mT).square_()
+        explained = explained.unflatten(1, vectors.shape[1:3]).sum(2)
+        lengths = shift.square().sum(2)[..., None]
+        return torch.baddbmm(lengths, shift, rows.mT, alpha=-2.0).sub_(explained)
 
 
 def _lengths(slots: Float[Tensor, "slots d"]) -> Float[Tensor, "slots"]:

@@ -124,11 +124,10 @@ class ExactClusterProducts:
         self._left, self._right = like.new_zeros(clusters, left), like.new_zeros(clusters, right)
         self._sum = like.new_zeros(shape, dtype=torch.int64)
 
-    def look(self, blocks: ClusterBlocks, *values: Float[Tensor, "slots _"]) -> None:
-        """Some points' values of both kinds, to find the largest of each cluster and column."""
-        for largest, own in zip((self._left, self._right), values, strict=True):
-            found = torch.cat([rows.abs().amax(1) for _, (rows,) in blocks.runs(own)])
-            torch.maximum(largest, blocks.by_number(found), out=largest)
+    def look(self, *largest: Float[Tensor, "clusters _"]) -> None:
+        """Largest magnitudes of some points' values of both kinds."""
+        for known, own in zip((self._left, self._right), largest, strict=True):
+            torch.maximum(known, own, out=known)
 
     def looked(self) -> None:
         """All have been seen."""

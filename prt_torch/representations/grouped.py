@@ -195,6 +195,11 @@ class ClusterBlocks(nn.Module):
         sums = [rows.double().sum(1) for _, (rows,) in self.runs(slots)]  # 3x faster than dtype=
         return self.by_number(torch.cat(sums))
 
+    def largest(self, slots: Float[Tensor, "slots a"]) -> Float[Tensor, "clusters a"]:
+        """Largest magnitude over each cluster's slots."""
+        found = [rows.abs().amax(1) for _, (rows,) in self.runs(slots)]
+        return self.by_number(torch.cat(found))
+
     def sizes(self) -> Int[Tensor, "clusters"]:
         """Points a cluster."""
         return torch.bincount(self.cluster_of_slot[self.slot_of_point], minlength=self.num_clusters)

@@ -6,9 +6,10 @@ on one tensor. What a point gets does not depend on the chunk it is in, so a bud
 number of processes change sums by rounding of float64 only.
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -153,6 +154,11 @@ class SortedChunk:
     blocks: ClusterBlocks
     slots: Float[Tensor, "slots *rest"]
 
+    @functools.cached_property
+    def largest(self) -> Float[Tensor, "clusters *rest"]:
+        """Largest magnitude of each value in each cluster."""
+        return self.blocks.largest(self.slots)
+
     def matmul(
         self, values: Float[Tensor, "slots *rows a"], matrices: Float[Tensor, "clusters a b"]
     ) -> Float[Tensor, "slots *rows b"]:
@@ -193,6 +199,7 @@ class SortedPoints:
         self._means = means
         if self._kept is not None:
             _subtract(self._kept, means)
+            self._kept = replace(self._kept)  # which knows nothing of the slots as they were
 
     def __iter__(self) -> Iterator[SortedChunk]:
         if self._kept is not None:
@@ -239,27 +246,24 @@ class SortedPoints:
             left: Columns of the first.
             right: Columns of the second.
         """
-        once = [(c.blocks, *of_chunk(c)) for c in self] if self.points.in_one_chunk else None
+        once = [(c, *of_chunk(c)) for c in self] if self.points.in_one_chunk else None
 
-        def results() -> Iterator[tuple[ClusterBlocks, Tensor, Tensor]]:
-            yield from once or ((c.blocks, *of_chunk(c)) for c in self)
+        def results() -> Iterator[tuple[SortedChunk, Tensor, Tensor]]:
+            yield from once or ((c, *of_chunk(c)) for c in self)
 
         if self.points.like.dtype == torch.float64:
             total = self.points.like.new_zeros(self.num_clusters, left, right)
-            for blocks, first, second in results():
-                total += blocks.transposed_matmul(first, second)
+            for chunk, first, second in results():
+                total += chunk.blocks.transposed_matmul(first, second)
             return self.points.processes.sum(total)
-        sums = ExactClusterProducts(
-            (self.num_clusters, left, right),
-            self.points.like,
-            self.points.total,
-            self.points.processes,
-        )
-        for blocks, first, second in results():
-            sums.look(blocks, first, second)
+        shape, like = (self.num_clusters, left, right), self.points.like
+        sums = ExactClusterProducts(shape, like, self.points.total, self.points.processes)
+        for chunk, first, second in results():
+            own = chunk.largest if first is chunk.slots else chunk.blocks.largest(first)
+            sums.look(own, chunk.blocks.largest(second))
         sums.looked()
-        for blocks, first, second in results():
-            sums.add(blocks, first, second)
+        for chunk, first, second in results():
+            sums.add(chunk.blocks, first, second)
         return sums.value()
 
 
