@@ -26,7 +26,8 @@ test-all: $(INSTALLED)
 # Shape annotations checked at run time, on the tests that pass tensors about.
 test-types: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 --jaxtyping-packages=prt_torch,beartype.beartype \
-	  tests/test_sphere.py tests/test_sh.py tests/test_baking.py tests/test_hemisphere.py
+	  tests/test_sphere.py tests/test_sh.py tests/test_baking.py tests/test_hemisphere.py \
+	  tests/test_cpca.py tests/test_fitting.py tests/test_relight.py tests/test_glossy.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
