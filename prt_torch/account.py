@@ -29,6 +29,11 @@ PICTURES = "pictures"  # folder of them inside a run folder
 _ALL_BUT_ONE = 24  # functions of order 5 without the best replaced one
 _VIEWS = 6  # around the scene, that errors of glossy transfer are averaged over
 _DENSE_BLOCK_POINTS = 2000  # timed and scaled up when the whole tensor does not fit
+_NO_OPENGL = {
+    "what": "the OpenGL preview",
+    "why": "not asked for, or no EGL here; the ray-cast pictures are exact anyway",
+    "saved_seconds": 0.0,
+}
 
 
 @torch.no_grad()
@@ -71,8 +76,11 @@ def write_report(
         opengl=preview.opengl,
     )
     report = facts(inputs, transfer)
-    report["left_out"] = _left_out(inputs, transfer, opengl_missing=not opengl_drew)
-    report["left_out"] += _left_out_segments(transfer, fitted)
+    report["left_out"] = [
+        *left_out(inputs, transfer),
+        *([] if opengl_drew else [_NO_OPENGL]),
+        *_left_out_segments(transfer, fitted),
+    ]
     report["solves"] = [solve.entry() for solve in solved]
     report["results"] = []
     for one in fitted:
@@ -174,15 +182,13 @@ def facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:
     }
 
 
-def _left_out(
-    inputs: Inputs, transfer: TransferTensor, *, opengl_missing: bool
-) -> list[dict[str, Any]]:
+def left_out(inputs: Inputs, transfer: TransferTensor) -> list[dict[str, Any]]:
     """What this scene does not need, why, and what leaving it out saved."""
     mesh, values = inputs.mesh, transfer.num_bytes - transfer.surface.reflectance.nbytes
     needless = transfer.provenance.get("left_out", [])
-    left_out = [*_left_out_rays(transfer), *_left_out_light(transfer), *needless]
+    entries = [*_left_out_rays(transfer), *_left_out_light(transfer), *needless]
     if transfer.num_channels == 1 and not any("channels" in one["what"] for one in needless):
-        left_out.append(
+        entries.append(
             {
                 "what": "two of three colour channels of transfer",
                 "why": "colour is a factor of its own, or there is none",
@@ -190,7 +196,7 @@ def _left_out(
             }
         )
     if not transfer.surface.exit_basis.view_dependent:
-        left_out.append(
+        entries.append(
             {
                 "what": "views and exit rows",
                 "why": "the material is diffuse: radiance is the same in every direction",
@@ -198,7 +204,7 @@ def _left_out(
             }
         )
     elif transfer.num_rows == _ALL_BUT_ONE:
-        left_out.append(
+        entries.append(
             {
                 "what": "the exit function y_(1,0)",
                 "why": "over the hemisphere the other 24 replace it to 1.5e-5 of its square",
@@ -209,7 +215,7 @@ def _left_out(
     saved = 3 * mesh.num_points * reflectance.itemsize - reflectance_bytes(reflectance)
     if saved:
         shared = len(reflectance) == 1
-        left_out.append(
+        entries.append(
             {
                 "what": "reflectance by point",
                 "why": "all points have the same"
@@ -222,22 +228,14 @@ def _left_out(
     blind = int((mesh.normals == 0).all(dim=1).sum())
     if blind and rays_traced:
         per_point = transfer.provenance["visibility_seconds"] / (mesh.num_points - blind)
-        left_out.append(
+        entries.append(
             {
                 "what": f"rays of {blind} points",
                 "why": "they have no normal and are part of no face; their transfer is zero",
                 "saved_seconds": per_point * blind,
             }
         )
-    if opengl_missing:
-        left_out.append(
-            {
-                "what": "the OpenGL preview",
-                "why": "not asked for, or no EGL here; the ray-cast pictures are exact anyway",
-                "saved_seconds": 0.0,
-            }
-        )
-    return left_out
+    return entries
 
 
 def _left_out_segments(transfer: TransferTensor, fitted: list[Fitted]) -> list[dict[str, Any]]:

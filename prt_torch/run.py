@@ -63,9 +63,7 @@ def execute(config: RunConfig, console: Console | None = None) -> dict[str, Any]
     out = run_folder(config)
     with store.locked(out, what="output folder"):
         _check_folder(out, config, inputs)
-        transfer = _needed(config, _bake(config, inputs, console))
-        if transfer.surface.light_basis is not None:  # lights are projected to what transfer has
-            inputs = replace(inputs, light_basis=transfer.surface.light_basis)
+        inputs, transfer = needed(config, inputs, _bake(config, inputs, console))
         store.write_bytes(out / CONFIG, _claim(config, inputs).encode())
         metric = _metric(config, inputs, transfer)
         fitted = _fit_all(out, config, inputs, transfer, metric, console)
@@ -186,15 +184,20 @@ def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor
     return transfer
 
 
-def _needed(config: RunConfig, transfer: TransferTensor) -> TransferTensor:
-    """Transfer without what the scene does not need; its provenance says what that was."""
+def needed(
+    config: RunConfig, inputs: Inputs, transfer: TransferTensor
+) -> tuple[Inputs, TransferTensor]:
+    """Both without what the scene does not need; the transfer's provenance says what that was."""
     transfer, findings = leave_out(
         transfer,
         error=config.transfer.needless,
         force=[part for part in config.transfer.keep if part != "rays"],
     )
     entries = [found.entry() for found in findings if found.left_out]
-    return replace(transfer, provenance={**transfer.provenance, "left_out": entries})
+    transfer = replace(transfer, provenance={**transfer.provenance, "left_out": entries})
+    if transfer.surface.light_basis is not None:  # lights are projected to what transfer has
+        inputs = replace(inputs, light_basis=transfer.surface.light_basis)
+    return inputs, transfer
 
 
 def _progress(console: Console) -> Progress:

@@ -324,6 +324,18 @@ def run_sweep(arguments: list[str], folder: Path) -> dict:
     return sweep.execute(config, Console(quiet=True))
 
 
+def test_sweep_leaves_out_what_a_run_would(small_scene, tmp_path):
+    alone = [*small_scene, "scene.ground=false", "transfer.order=6", FIRST]
+    report = run_sweep(alone, tmp_path / "fewer")
+    assert report["light"]["coeffs"] < 36  # a convex diffuse ball hardly has a sixth band
+    (entry,) = [one for one in report["left_out"] if "bands" in one["what"]]
+    assert entry["saved_bytes"] > 0
+    forced = run_sweep([*alone, "transfer.keep=[bands]"], tmp_path / "all")
+    assert forced["light"]["coeffs"] == 36
+    assert not any("bands" in one["what"] for one in forced["left_out"])
+    assert forced["results"][0]["bytes"] > report["results"][0]["bytes"]
+
+
 FIRST = "sweep.representations=[{name: cpca, num_clusters: 8, rank: [1, 2]}]"
 BOTH = FIRST[:-1] + ", {name: wavelet, num_terms: [4, 2]}, {name: wavelet, codes: 11/11/10}]"
 

@@ -142,6 +142,12 @@ def test_a_point_tells_its_figures():
         assert part in line
 
 
+@pytest.mark.parametrize("cost", [1.0, 1.2, 8.4, 8.8, 9.5, 99.0])
+def test_costs_that_are_all_alike_have_ticks(cost):
+    drawn = plot([result("a", "a", 1, 0.1, fit_seconds=cost)], "fit_seconds", "transfer_error")
+    assert drawn.count('class="grid"') >= 6
+
+
 def test_nothing_to_plot_is_said():
     assert "no result has both" in plot([result("a", "a", 1, 0.0)], "bytes", "transfer_error")
 
@@ -163,6 +169,7 @@ def test_page_is_one_file_and_escapes(tmp_path):
         "light": {"basis": "SH", "coeffs": 9},
         "raw_bytes": 1000,
         "results": RESULTS,
+        "left_out": [{"what": "<bands>", "why": "nothing there", "saved_bytes": 7}],
         "failed": [{"what": "<w>", "why": "no"}],
         "budget": {"asked": "1 MiB", "name": "x1", "why": ["<because>"]},
     }
@@ -170,7 +177,7 @@ def test_page_is_one_file_and_escapes(tmp_path):
     write_tradeoff(tmp_path / "page.html", report, stages=stages, stages_of="Of x1.")
     page = (tmp_path / "page.html").read_text()
     assert not re.search(r'(src|href)="(?!data:)', page)
-    for raw in ("<b>", "<w>", "<because>"):
+    for raw in ("<b>", "<w>", "<because>", "<bands>"):
         assert raw not in page
         assert raw.replace("<", "&lt;").replace(">", "&gt;") in page
     assert page.count('data-name="x1"') >= 13  # twelve plots and the table

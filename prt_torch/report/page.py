@@ -79,7 +79,7 @@ def write_html(path: Path, report: Mapping[str, Any], pictures: Sequence[Picture
         _results(rows),
         _plots(report),
         pictures_section(pictures),
-        _left_out(report.get("left_out") or []),
+        left_out_section(report.get("left_out") or []),
         _endings(endings(report)),
     ]
     title = escape(_title(report))
@@ -355,7 +355,8 @@ def _figure(picture: Picture) -> str:
     )
 
 
-def _left_out(entries: Sequence[Mapping[str, Any]]) -> str:
+def left_out_section(entries: Sequence[Mapping[str, Any]]) -> str:
+    """What the scene did not need, as a table."""
     if not entries:
         return "<section><h2>What was left out</h2><p>Nothing.</p></section>\n"
     headings = [("What", "text"), ("Why", "text"), ("Saved", "")]

@@ -11,7 +11,7 @@ from typing import Any
 
 from prt_torch import store
 from prt_torch.report.numbers import bytes_text, error_text, percent_text, seconds_text
-from prt_torch.report.page import POLICY, Picture, pictures_section
+from prt_torch.report.page import POLICY, Picture, left_out_section, pictures_section
 from prt_torch.report.style import SORTING, STYLE
 from prt_torch.report.tradeoff_svg import TELLING, bars, family_style, legend, plot, told
 from prt_torch.tradeoff import COSTS, ERRORS, Stage, error_of, fronts
@@ -50,6 +50,7 @@ def write_tradeoff(
         _waterfall(stages, stages_of),
         pictures_section(pictures),
         _table(results),
+        left_out_section(report["left_out"]),
         _failed(report.get("failed") or []),
     ]
     store.write_bytes(

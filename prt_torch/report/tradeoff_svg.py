@@ -154,6 +154,15 @@ def plot(results: Sequence[Mapping[str, Any]], cost: str, error: str) -> str:
     return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img">{"".join(parts)}</svg>'
 
 
+_ROUND = (
+    (1,),
+    (1, 3),
+    (1, 2, 5),
+    (1, 1.5, 2, 3, 4, 5, 6, 8),
+    tuple(tenth / 10 for tenth in range(10, 100)),  # no axis is too short for three of these
+)
+
+
 class _Axis:
     """A logarithmic axis from a first to a last coordinate, with some room."""
 
@@ -174,7 +183,7 @@ class _Axis:
             powers = range(math.ceil(self.low / _LOG2), math.floor(self.high / _LOG2) + 1)
             return [2.0**power for power in powers][:: math.ceil(len(powers) / 7) or 1]
         decades = range(math.floor(self.low), math.ceil(self.high) + 1)
-        for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8)):
+        for steps in _ROUND:
             every = [step * 10.0**decade for decade in decades for step in steps]
             inside = [one for one in every if self.low <= math.log10(one) <= self.high]
             if len(inside) >= 3:

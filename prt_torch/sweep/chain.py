@@ -22,7 +22,7 @@ from prt_torch.metric import Metric
 from prt_torch.nesting import Chain, Made, nested
 from prt_torch.representations import Representation, load, save
 from prt_torch.representations.cpca_subspaces import one_thread
-from prt_torch.run import bake_only
+from prt_torch.run import bake_only, needed
 from prt_torch.settings import KINDS, RunConfig
 from prt_torch.sweep.measure import Judge
 from prt_torch.transfer import Surface, TransferTensor
@@ -112,8 +112,8 @@ def prepare(config: RunConfig) -> tuple[Inputs, Problem]:
     Raises:
         InputError: If an input is unusable or the cache cannot be written.
     """
-    inputs = load_inputs(config)
-    transfer = bake_only(config, Console(quiet=True))
+    baked = bake_only(config, Console(quiet=True))
+    inputs, transfer = needed(config, load_inputs(config), baked)
     metric = _light_prior(config, inputs, transfer)
     return inputs, Problem(transfer, metric, config.seed, config.memory_budget)
 

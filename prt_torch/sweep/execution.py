@@ -23,7 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from prt_torch import store
-from prt_torch.account import facts
+from prt_torch.account import facts, left_out
 from prt_torch.budget import Choice, Limits, Tried, refine
 from prt_torch.construction import Problem
 from prt_torch.errors import InputError
@@ -289,7 +289,12 @@ def _gather(
                 store.write_json(path, times)
                 last = time.monotonic()
     store.write_json(path, times)
-    return {**facts(inputs, judge.transfer), "left_out": [], "failed": failed, "results": results}
+    return {
+        **facts(inputs, judge.transfer),
+        "left_out": left_out(inputs, judge.transfer),
+        "failed": failed,
+        "results": results,
+    }
 
 
 def _result(
