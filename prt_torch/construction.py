@@ -10,6 +10,8 @@ from prt_torch.representations import Representation
 from prt_torch.representations.files import KINDS
 from prt_torch.transfer import TransferTensor
 
+_CPCA_COPIES = 8  # of the tensor, which a fit of CPCA without a budget takes at most
+
 Parameters = dict[str, Any]
 """Keywords of a kind's ``from_transfer``, in plain JSON."""
 
@@ -52,4 +54,6 @@ def closed_form(problem: Problem, kind: str, parameters: Parameters) -> Represen
             common = {}
         case "segmented_cpca" | "clustered_tensor" | "scattered_srbf":
             common["memory_budget"] = problem.memory_budget
+        case "cpca" if _CPCA_COPIES * problem.transfer.num_bytes > problem.memory_budget:
+            common["memory_budget"] = problem.memory_budget  # in chunks: slower, the same result
     return KINDS[kind].from_transfer(problem.transfer, **parameters, **common)

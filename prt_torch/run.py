@@ -156,8 +156,10 @@ def _bake(config: RunConfig, inputs: Inputs, console: Console) -> TransferTensor
     with _progress(console) as progress:
 
         def stage(what: str) -> Callable[[int, int], None]:
-            task = progress.add_task(what, total=inputs.mesh.num_points)
-            return lambda done, total: progress.update(task, completed=done, total=total)
+            task = progress.add_task(what, visible=False)  # until it begins
+            return lambda done, total: progress.update(
+                task, completed=done, total=total, visible=True
+            )
 
         transfer = bake(
             inputs.mesh,

@@ -19,6 +19,7 @@ import torch.distributed as distributed
 from contract import random_transfer, relative
 
 from prt_torch import store
+from prt_torch.construction import Problem, closed_form
 from prt_torch.errors import InputError
 from prt_torch.evaluate import transfer_error
 from prt_torch.representations import CPCA, ClusteredTensor
@@ -33,7 +34,12 @@ FITS: dict[str, tuple[type[CPCA | ClusteredTensor], dict[str, Any]]] = {
     "cpca": (CPCA, {"num_clusters": 6, "rank": 2}),
     "adaptive": (CPCA, {"num_clusters": 8, "rank": 2, "method": "adaptive"}),
     "linear": (CPCA, {"num_clusters": 4, "rank": 2, "method": "static", "affine": False}),
+    "coded": (CPCA, {"num_clusters": 6, "rank": 3, "quantisation_share": 4.0}),
     "clustered_tensor": (ClusteredTensor, {"num_clusters": 4, "ranks": (2, 6, 3)}),
+    "coded_tensor": (
+        ClusteredTensor,
+        {"num_clusters": 4, "ranks": (2, 6, 3), "quantisation_share": 1.0},
+    ),
 }
 FEW_PASSES: dict[str, tuple[type[CPCA | ClusteredTensor], dict[str, Any]]] = {
     "cpca": (CPCA, {"num_clusters": 1, "rank": 3}),
@@ -215,3 +221,24 @@ def test_no_room_for_scratch_rows(monkeypatch):
     rows = ScratchRows((5, 2), torch.zeros(1))
     with pytest.raises(InputError, match=r"memory_budget: .* 40 bytes .*No space left"):
         rows[0:5] = torch.zeros(5, 2)
+
+
+def test_a_run_keeps_its_memory_budget_with_the_same_result(monkeypatch):
+    transfer = random_transfer(3000, coeffs=300, dtype=torch.float32)
+    parameters = {"num_clusters": 2, "rank": 1}
+    asked, real = [], CPCA.from_transfer
+
+    def spied(*args: Any, **options: Any) -> CPCA:
+        asked.append(options.get("memory_budget"))
+        return real(*args, **options)
+
+    monkeypatch.setattr(CPCA, "from_transfer", spied)
+    much, little = 8 * transfer.num_bytes, 8 * transfer.num_bytes - 1
+    models = [
+        closed_form(Problem(transfer, memory_budget=budget), "cpca", parameters)
+        for budget in (much, little)
+    ]
+    assert asked == [None, little]
+    assert all(
+        torch.equal(a, b) for a, b in zip(*(m.packed().values() for m in models), strict=True)
+    )
