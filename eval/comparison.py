@@ -51,11 +51,11 @@ class Part:
 
 
 PARTS = (
-    Part("diffuse", ("sweep=comparison",), (1 / 8, 1 / 4, 1 / 2)),
+    Part("diffuse", ("sweep=comparison",), (1 / 32, 1 / 8, 1 / 4)),
     Part(
         "glossy",
         ("sweep=comparison_glossy", "material=glossy", "transfer=sh_factors", "transfer.order=5"),
-        (1 / 32, 1 / 16, 1 / 4),
+        (1 / 128, 1 / 32, 1 / 8),
     ),
 )
 

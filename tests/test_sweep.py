@@ -375,6 +375,27 @@ def test_sweep_with_a_budget_explains_its_choice_and_where_its_error_is_from(sma
     assert report["budget"]["why"][0].split(":")[0] in page
 
 
+@pytest.mark.parametrize(
+    ("entry", "coded"),
+    [
+        ("{name: cpca, num_clusters: 4, rank: 3, quantisation_share: 4}", True),
+        (
+            "{name: clustered_tensor, num_clusters: 4, ranks: [1, 4, 4], quantisation_share: 1}",
+            True,
+        ),
+        ("{name: wavelet, num_terms: 9, codes: float}", False),
+    ],
+)
+def test_codes_are_a_stage_of_their_own(small_scene, tmp_path, entry, coded):
+    wanted = [f"sweep.representations=[{entry}]", "sweep.waterfall=true"]
+    report = run_sweep([*small_scene, *wanted], tmp_path)
+    stages = {one["name"]: one for one in report["waterfall"]["stages"]}
+    assert ("codes" in stages) == coded
+    if coded:
+        assert abs(stages["codes"]["difference"]) > 1e-6 * stages["rank"]["error"]
+        assert stages["codes"]["alone"] > 1e-9
+
+
 def test_folder_of_another_sweep_is_refused(small_scene, tmp_path):
     run_sweep([*small_scene, FIRST], tmp_path)
     with pytest.raises(InputError, match="holds another sweep"):

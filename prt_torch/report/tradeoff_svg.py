@@ -45,7 +45,7 @@ def family_style(families: Sequence[str]) -> str:
 @media (prefers-color-scheme: dark) {{ :root {{ {colours(DARK.families)} }} }}
 {rules}
 .plots {{ display: grid; gap: 12px; grid-template-columns: repeat(auto-fit, minmax(430px, 1fr)); }}
-svg {{ display: block; width: 100%; height: auto; font-size: 11.5px; }}
+svg {{ display: block; width: 100%; height: auto; font-size: 11.5px; overflow: visible; }}
 svg text {{ fill: var(--muted); }}
 svg text.title {{ fill: var(--ink); font-weight: 600; }}
 svg .grid {{ stroke: var(--line); }}

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from pydantic import BaseModel
 from torch import Tensor
 
 from prt_torch import evaluate
@@ -27,7 +28,7 @@ from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
 from prt_torch.representations import Representation
-from prt_torch.settings import RunConfig
+from prt_torch.settings import KINDS, RunConfig
 from prt_torch.sweep.measure import VIEWS
 from prt_torch.tradeoff import Stage, waterfall
 from prt_torch.transfer import TransferTensor, project
@@ -49,10 +50,11 @@ _ONE_CLUSTER: dict[str, Parameters] = {
     "clustered_tensor": {"num_clusters": 1},
 }
 _NO_CODES: dict[str, Parameters] = {
+    "cpca": {"quantisation_share": None},
     "segmented_cpca": {"quantisation_share": 0.0},
-    "clustered_tensor": {"bits": None},
+    "clustered_tensor": {"bits": None, "quantisation_share": None},
     "scattered_srbf": {"bits": None},
-    "zonal_lobes": {"bits": None},
+    "zonal_lobes": {"bits": None, "quantisation_share": None},
     "wavelet": {"codes": "float"},
 }
 
@@ -106,9 +108,14 @@ def _models(problem: Problem, kind: str, parameters: Parameters) -> dict[str, Re
         found["clusters"] = closed_form(problem, kind, {**uncoded, **_LEAST[kind]})
     name = "rank" if kind in _LEAST else kind
     found[name] = closed_form(problem, kind, uncoded)
-    if uncoded != parameters:
+    if _named(kind, uncoded) != _named(kind, parameters):
         found["codes"] = closed_form(problem, kind, parameters)
     return found
+
+
+def _named(kind: str, parameters: Parameters) -> BaseModel:
+    """All parameters, those that were not given too."""
+    return KINDS[kind].model_validate({"name": kind, **parameters})
 
 
 def _alone(
