@@ -499,9 +499,18 @@ def test_queue_gives_results_and_errors(monkeypatch, tmp_path):
     assert FakeQueue.options["timeout_min"] == SlurmConfig.model_validate({}).minutes
 
 
-def test_a_killed_worker_is_one_line():
+class KilledWorker(Exception):
+    """As Dask has one."""
+
+
+class UncompletedJobError(RuntimeError):
+    """As submitit has one."""
+
+
+@pytest.mark.parametrize("error", [BrokenExecutor, KilledWorker, UncompletedJobError])
+def test_a_killed_worker_is_one_line(error):
     future: Future = Future()
-    future.set_exception(BrokenExecutor("gone"))
+    future.set_exception(error("gone"))
     with pytest.raises(InputError, match=r"sweep.workers: a worker was killed"):
         _outcome(future)
 

@@ -10,7 +10,7 @@ Chains run side by side, so times to relight are measured at the end, when nothi
 
 import time
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from prt_torch.sweep.measure import Judge
 from prt_torch.sweep.pictures import pictures
 from prt_torch.sweep.settings import BudgetConfig, SweepRun
 from prt_torch.sweep.waterfall import error_stages, explained
-from prt_torch.sweep.workers import count, workers
+from prt_torch.sweep.workers import count, was_lost, workers
 from prt_torch.tradeoff import COSTS, ERRORS, fronts
 from prt_torch.transfer import TransferTensor
 
@@ -227,10 +227,12 @@ def _outcome(future: Future[str | None]) -> str | None:
     """What was wrong with a chain, or None."""
     try:
         return future.result()
-    except BrokenExecutor as error:
+    except Exception as error:
+        if not was_lost(error):
+            raise
         raise InputError(
-            "sweep.workers: a worker was killed, perhaps for want of memory; start the same "
-            "command again to go on, with fewer workers if need be"
+            "sweep.workers: a worker was killed, perhaps for want of memory or time; start the "
+            "same command again to go on, with fewer workers if need be"
         ) from error
 
 

@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from prt_torch.errors import InputError
 from prt_torch.sweep.settings import SlurmConfig, SweepConfig
 
 _POLL_SECONDS = 2.0
+_LOST = {"KilledWorker", "UncompletedJobError"}  # of Dask and submitit, by name: they may be absent
 
 
 @contextmanager
@@ -58,6 +59,11 @@ def workers(config: SweepConfig, folder: Path) -> Iterator[Executor]:
 def count(config: SweepConfig) -> int:
     """How many chains run side by side on this machine."""
     return config.workers or len(os.sched_getaffinity(0))
+
+
+def was_lost(error: Exception) -> bool:
+    """Whether a worker ended without an answer: killed, say, or beyond the time of its queue."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ in _LOST
 
 
 def _package(module: str, executor: str, install: str) -> Any:
