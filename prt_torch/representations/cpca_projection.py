@@ -26,7 +26,8 @@ from prt_torch.transfer import TransferTensor
 
 _STEPS = 2  # the third lowered what is lost by 4 % on glossy transfer, from 4e-5 of the energy
 _TILE = 1024  # rows of the directions
-_ROWS = 64  # of values that are multiplied together at least
+_ROWS = 64  # of values that are multiplied together at least, where memory allows
+_JOINED_SHARE = 4  # of a chunk
 Blocks = Callable[[], Iterator[tuple[slice, Tensor]]]
 """Reads ranges of rows with their values, ``"some values"``, from the first to the last."""
 
@@ -126,13 +127,18 @@ def _tiles(rows: Tensor | ScratchRows) -> Iterator[slice]:
     return slices(rows.shape[0], _TILE)
 
 
-def _columns(blocks: Blocks, some: slice) -> Iterator[tuple[slice, Float[Tensor, "rows some"]]]:
+def _columns(
+    blocks: Blocks, some: slice, memory: Memory
+) -> Iterator[tuple[slice, Float[Tensor, "rows some"]]]:
     """Some columns of the values, of enough rows at a time where only few can be read together."""
-    first, held = 0, []
+    first, held, enough = 0, [], _ROWS
     for rows, values in blocks():
         own = values[:, some]
-        held.append(own if len(own) >= _ROWS else own.clone())  # all other columns may go
-        if rows.stop - first >= _ROWS:
+        if memory.chunk_bytes is not None:
+            row_bytes = own.shape[1] * own.itemsize
+            enough = min(_ROWS, memory.chunk_bytes // (_JOINED_SHARE * row_bytes))
+        held.append(own if len(own) >= enough else own.clone())  # all other columns may go
+        if rows.stop - first >= enough:
             yield slice(first, rows.stop), _joined(held)
             first, held = rows.stop, []
     if held:
@@ -147,10 +153,11 @@ def _products(blocks: Blocks, lift: Tensor | ScratchRows, points: Points) -> Non
     """Write the rows' products with the directions to the points."""
     size, width = lift.shape
     table_bytes = points.memory.table_bytes
-    tiles = size if table_bytes is None else table_bytes // (points.like.itemsize * width * _TILE)
+    tile_bytes = points.like.itemsize * width * _TILE
+    tiles = size if table_bytes is None else table_bytes // (2 * tile_bytes)
     for some in slices(size, max(1, tiles) * _TILE):
         held = lift[some]
-        for block, values in _columns(blocks, some):
+        for block, values in _columns(blocks, some, points.memory):
             total = points.rows[block] if some.start else values.new_zeros(len(values), width)
             for tile in _tiles(held):
                 total += steady_product(values[:, tile], held[tile])
@@ -169,7 +176,7 @@ def _images(
     at_once = size if table_bytes is None else max(1, table_bytes // (8 * width))
     for some in slices(size, at_once):
         total = ExactProducts(largest[some], right, points.total, points.processes)
-        for block, values in _columns(blocks, some):
+        for block, values in _columns(blocks, some, points.memory):
             total.add(values, points.rows[block])
         images[some] = total.value()
 
