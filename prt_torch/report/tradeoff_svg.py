@@ -183,6 +183,7 @@ class _Axis:
             powers = range(math.ceil(self.low / _LOG2), math.floor(self.high / _LOG2) + 1)
             return [2.0**power for power in powers][:: math.ceil(len(powers) / 7) or 1]
         decades = range(math.floor(self.low), math.ceil(self.high) + 1)
+        inside: list[float] = []
         for steps in _ROUND:
             every = [step * 10.0**decade for decade in decades for step in steps]
             inside = [one for one in every if self.low <= math.log10(one) <= self.high]
