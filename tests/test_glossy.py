@@ -112,7 +112,6 @@ def test_uniform_light_gives_the_directional_albedo(brdf):
     assert math.sqrt(float(lost)) < 0.03
 
 
-@pytest.mark.slow
 def test_turning_an_anisotropic_material_turns_its_matrix():
     along = AshikhminShirley(specular=0.5, diffuse=0.1, exponent_u=20.0, exponent_v=2.0)
     across = AshikhminShirley(specular=0.5, diffuse=0.1, exponent_u=2.0, exponent_v=20.0)
@@ -331,7 +330,6 @@ def test_unshadowed_light_is_reflected_exactly(constants):
     assert relative(found, values @ (sh.evaluate(nodes, 4) @ light)) < 1e-4
 
 
-@pytest.mark.slow
 def test_factors_by_nodes_that_follow_lobes():
     """A second implementation where lobes are wide; where they are sharp, albedo tells."""
     found, change = factor_in_harmonics(

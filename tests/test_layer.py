@@ -24,7 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from prt_torch.bases import HemisphericalHarmonics, SphericalHarmonics
 from prt_torch.relight import Relighter
-from prt_torch.representations.files import KINDS
+from prt_torch.representations.files import KINDS, load, save
 from prt_torch.sphere import frame_from_normal
 from prt_torch.transfer import TransferTensor
 
@@ -165,12 +165,20 @@ def compiled_holds(kind: str, said: str, backend: str, tolerance: float) -> None
     holds(said, check)
 
 
-@rows_of(
-    "`torch.compile(fullgraph=True)`",
-    *("clustered_tensor", "dense", "scattered_srbf", "segmented_cpca", "zonal_lobes"),
-)
+@rows_of("`torch.compile(fullgraph=True)`")
 def test_traced_without_a_break(kind, said, without_type_checker):
     compiled_holds(kind, said, "eager", FLOAT)
+
+
+@pytest.mark.parametrize("kind", ["cpca", "clustered_tensor"])
+def test_traced_as_loaded(kind, tmp_path, without_type_checker):
+    """Before anything was evaluated."""
+    fitted, path = made(kind), tmp_path / "fitted.safetensors"
+    save(fitted.representation, path)
+    relight = Relighter(load(path, geometry=fitted.representation.surface))
+    torch._dynamo.reset()
+    found = torch.compile(relight, backend="eager", fullgraph=True)(LIGHT, EYES)
+    assert relative(found, fitted(LIGHT, EYES)) < FLOAT
 
 
 @pytest.mark.slow

@@ -153,7 +153,8 @@ class ClusteredTensor(CodedRepresentation):
                 rounding only; where even tables of all clusters are large beside it, fewer light
                 axes are kept than the error asks for, and ``statistics.projection_lost`` says what
                 that costs. Where it is short,
-                tables for fast evaluation are made at the first call, outside of it.
+                tables for fast evaluation, where they do not fit, are made at the first call,
+                outside of it.
             process_group: Processes that share the work, each with points of its own, in order of
                 rank; every process makes this call with the same options. The result has all
                 clusters and this process's points (:meth:`gathered` makes one of all), and the
@@ -204,7 +205,7 @@ class ClusteredTensor(CodedRepresentation):
         found = cls(encoding, transfer.surface, tuple(transfer.values.shape), coding)
         found.statistics = statistics
         if len(found.labels) * _TABLE_BYTES <= memory_budget // 16:
-            found._blocks = ClusterBlocks(found.labels, found.num_clusters)
+            found._blocks = found.blocks  # which no compiler can trace
         return found
 
     def _rounded(self) -> dict[str, Tensor]:
@@ -256,6 +257,7 @@ class ClusteredTensor(CodedRepresentation):
         surface = processes.gather_surface(self.surface, self.num_points)
         found = ClusteredTensor(encoding, surface, (len(weights), *self.shape[1:]), self._coding())
         found.statistics = self.statistics
+        found._blocks = found.blocks
         return found
 
     @property
@@ -363,7 +365,7 @@ class ClusteredTensor(CodedRepresentation):
         else:
             encoding, coding = unpack(packed), None
         found = cls(encoding, surface, shape, coding)
-        found._blocks = ClusterBlocks(found.labels, found.num_clusters)
+        found._blocks = found.blocks
         return found
 
     def coherence(self, faces: Int[Tensor, "faces 3"]) -> dict[str, float]:

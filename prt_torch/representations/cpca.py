@@ -38,6 +38,7 @@ from prt_torch.representations.processes import Processes
 from prt_torch.transfer import Surface, TransferTensor
 
 _BLOCK_BYTES = 2**25
+_TABLE_BYTES = 64  # a point, of tables for evaluation, and four a weight
 
 
 class CPCA(CodedRepresentation):
@@ -123,8 +124,8 @@ class CPCA(CodedRepresentation):
             memory_budget: Bytes that all of this may take at its peak, the result included and what
                 was there before left out; as much as it takes if not given. Where it is short,
                 points are kept in a temporary file (``TMPDIR``) and read in chunks, which takes
-                longer and changes the result by rounding only. Tables for fast evaluation are made
-                at the first call, outside of it.
+                longer and changes the result by rounding only. Tables for fast evaluation, where
+                they do not fit, are made at the first call, outside of it.
             process_group: Processes that share the work, each with points of its own, in order of
                 rank; every process makes this call with the same options. The result has all
                 clusters and this process's points (:meth:`gathered` makes one of all), and the
@@ -160,11 +161,14 @@ class CPCA(CodedRepresentation):
             processes=Processes(process_group),
         )
         model = cls(encoding, transfer.surface, tuple(transfer.values.shape))
-        if quantisation_share is None:
-            return model
-        return model.coded(
-            transfer, share=quantisation_share, metric=metric, process_group=process_group
-        )
+        if quantisation_share is not None:
+            return model.coded(
+                transfer, share=quantisation_share, metric=metric, process_group=process_group
+            )
+        table_bytes = transfer.num_points * _TABLE_BYTES + 4 * len(encoding.weights)
+        if memory_budget is None or table_bytes <= memory_budget // 16:
+            model._make_tables()
+        return model
 
     @torch.no_grad()
     def coded(
@@ -204,7 +208,7 @@ class CPCA(CodedRepresentation):
             metric=metric.in_float32(),
             processes=processes,
         )
-        return CPCA(encoding, self.surface, self.shape, coding)
+        return CPCA(encoding, self.surface, self.shape, coding)._make_tables()
 
     @classmethod
     def within(
@@ -275,7 +279,8 @@ class CPCA(CodedRepresentation):
             self._encoding(), labels=labels, weights=processes.gather(self.weights.detach())
         )
         surface = processes.gather_surface(self.surface, self.num_points)
-        return CPCA(encoding, surface, (len(labels), *self.shape[1:]), self._coding())
+        found = CPCA(encoding, surface, (len(labels), *self.shape[1:]), self._coding())
+        return found._make_tables()
 
     def _encoding(self) -> Encoding:
         return Encoding(
@@ -304,16 +309,21 @@ class CPCA(CodedRepresentation):
         values = own if coding is None else coding.rounded(*own)
         return dict(zip(("representatives", "weights"), values, strict=True))
 
+    def _make_tables(self) -> "CPCA":
+        """Those of evaluation at once: a compiler cannot trace how they are made."""
+        self._blocks, self._layout = self.blocks, self.layout
+        return self
+
     @property
     def blocks(self) -> ClusterBlocks:
-        """Points sorted by cluster; made where first needed, as it takes more than the weights."""
+        """Points sorted by cluster; made where first needed if memory was short."""
         if self._blocks is None:
             self._blocks = ClusterBlocks(self.labels, len(self.ranks))
         return self._blocks
 
     @property
     def layout(self) -> VectorLayout:
-        """Places of vectors and weights; made where first needed."""
+        """Places of vectors and weights; made where first needed if memory was short."""
         if self._layout is None:
             self._layout = VectorLayout(self.labels, self.ranks, self.affine)
         return self._layout
@@ -374,7 +384,7 @@ class CPCA(CodedRepresentation):
     ) -> "CPCA":
         """The inverse of :meth:`packed`."""
         encoding, coding = unpack(packed, surface, shape)
-        return cls(encoding, surface, shape, coding)
+        return cls(encoding, surface, shape, coding)._make_tables()
 
     @property
     def budget(self) -> dict[str, Any]:
