@@ -299,7 +299,7 @@ def more_clusters(dtype: torch.dtype, seeds: int) -> Outcome:
         (
             *(exactly(f"most clusters, {name}", count, 3) for name, count in made.items()),
             at_least("points of the smallest cluster", smallest, 1),
-            at_most("squared error", worst, (64 * rounding(dtype)) ** 2),
+            at_most("squared error", worst, (16 * rounding(dtype)) ** 2),
             exactly("numbers not finite", bad, 0),
         )
     )

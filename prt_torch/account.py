@@ -218,9 +218,7 @@ def left_out(inputs: Inputs, transfer: TransferTensor) -> list[dict[str, Any]]:
         entries.append(
             {
                 "what": "reflectance by point",
-                "why": "all points have the same"
-                if shared
-                else "a file keeps its few colours once",
+                "why": "all have the same" if shared else "a file keeps a few colours once",
                 "saved_bytes": saved,
             }
         )

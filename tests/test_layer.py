@@ -8,7 +8,6 @@ import os
 import pickle
 import re
 import socket
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -425,13 +424,7 @@ def share(rank: int, folder: Path, port: int) -> None:
                 relight(LIGHT, EYES)
         layers[kind] = DistributedDataParallel(relight, broadcast_buffers=False)
         errors[kind] = split_errors(layers[kind], relight, slice(rank, None, 2))
-    (folder / f"{rank}.part").write_text(json.dumps(errors))
-    (folder / f"{rank}.part").rename(folder / f"{rank}.json")
-    for _ in range(600):  # the other one may still be waiting for what this one sent
-        if (folder / f"{1 - rank}.json").exists():
-            break
-        time.sleep(0.1)
-    os._exit(0)  # taking gloo down was seen to deadlock in a destructor
+    leave(folder, rank, errors)
 
 
 def split_errors(layer: DistributedDataParallel, relight: Relighter, own: slice) -> list[float]:

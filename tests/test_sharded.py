@@ -9,7 +9,6 @@ import json
 import multiprocessing
 import os
 import re
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import pytest
 import torch
 import torch.distributed as distributed
 from contract import random_transfer, relative
+from two_processes import leave
 
 from prt_torch import store
 from prt_torch.construction import Problem, closed_form
@@ -92,13 +92,7 @@ def share(rank: int, folder: Path) -> None:
             "errors": [transfer_error(model, whole), transfer_error(alone, whole)],
             "reflectance": torch.equal(model.surface.reflectance, alone.surface.reflectance),
         }
-    (folder / f"{rank}.part").write_text(json.dumps(found))
-    (folder / f"{rank}.part").rename(folder / f"{rank}.json")
-    for _ in range(600):  # the other one may still be waiting for what this one sent
-        if (folder / f"{1 - rank}.json").exists():
-            break
-        time.sleep(0.1)
-    os._exit(0)  # taking gloo down was seen to deadlock in a destructor
+    leave(folder, rank, found)
 
 
 def measure(folder: Path) -> None:

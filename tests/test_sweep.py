@@ -324,6 +324,10 @@ def run_sweep(arguments: list[str], folder: Path) -> dict:
     return sweep.execute(config, Console(quiet=True))
 
 
+FIRST = "sweep.representations=[{name: cpca, num_clusters: 8, rank: [1, 2]}]"
+BOTH = FIRST[:-1] + ", {name: wavelet, num_terms: [4, 2]}, {name: wavelet, codes: 11/11/10}]"
+
+
 def test_sweep_leaves_out_what_a_run_would(small_scene, tmp_path):
     alone = [*small_scene, "scene.ground=false", "transfer.order=6", FIRST]
     report = run_sweep(alone, tmp_path / "fewer")
@@ -334,10 +338,6 @@ def test_sweep_leaves_out_what_a_run_would(small_scene, tmp_path):
     assert forced["light"]["coeffs"] == 36
     assert not any("bands" in one["what"] for one in forced["left_out"])
     assert forced["results"][0]["bytes"] > report["results"][0]["bytes"]
-
-
-FIRST = "sweep.representations=[{name: cpca, num_clusters: 8, rank: [1, 2]}]"
-BOTH = FIRST[:-1] + ", {name: wavelet, num_terms: [4, 2]}, {name: wavelet, codes: 11/11/10}]"
 
 
 def test_sweep_takes_further_points_and_leaves_out_what_does_not_suit(small_scene, tmp_path):

@@ -152,9 +152,8 @@ class ClusteredTensor(CodedRepresentation):
                 (``TMPDIR``) and read in chunks, which takes longer and changes the result by
                 rounding only; where even tables of all clusters are large beside it, fewer light
                 axes are kept than the error asks for, and ``statistics.projection_lost`` says what
-                that costs. Where it is short,
-                tables for fast evaluation, where they do not fit, are made at the first call,
-                outside of it.
+                that costs. Tables for fast evaluation, where they do not fit, are made at the first
+                call, outside of it.
             process_group: Processes that share the work, each with points of its own, in order of
                 rank; every process makes this call with the same options. The result has all
                 clusters and this process's points (:meth:`gathered` makes one of all), and the

@@ -161,14 +161,14 @@ class CPCA(CodedRepresentation):
             processes=Processes(process_group),
         )
         model = cls(encoding, transfer.surface, tuple(transfer.values.shape))
-        if quantisation_share is not None:
-            return model.coded(
-                transfer, share=quantisation_share, metric=metric, process_group=process_group
-            )
         table_bytes = transfer.num_points * _TABLE_BYTES + 4 * len(encoding.weights)
         if memory_budget is None or table_bytes <= memory_budget // 16:
             model._make_tables()
-        return model
+        if quantisation_share is None:
+            return model
+        return model.coded(
+            transfer, share=quantisation_share, metric=metric, process_group=process_group
+        )
 
     @torch.no_grad()
     def coded(
@@ -208,7 +208,8 @@ class CPCA(CodedRepresentation):
             metric=metric.in_float32(),
             processes=processes,
         )
-        return CPCA(encoding, self.surface, self.shape, coding)._make_tables()
+        found = CPCA(encoding, self.surface, self.shape, coding)
+        return found if self._blocks is None else found._make_tables()
 
     @classmethod
     def within(

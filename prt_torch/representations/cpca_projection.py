@@ -128,15 +128,15 @@ def _tiles(rows: Tensor | ScratchRows) -> Iterator[slice]:
 
 
 def _columns(
-    blocks: Blocks, some: slice, memory: Memory
+    blocks: Blocks, some: slice, points: Points
 ) -> Iterator[tuple[slice, Float[Tensor, "rows some"]]]:
     """Some columns of the values, of enough rows at a time where only few can be read together."""
-    first, held, enough = 0, [], _ROWS
+    chunk_bytes = points.memory.chunk_bytes
+    row_bytes = (some.stop - some.start) * points.like.itemsize
+    rows_of_share = _ROWS if chunk_bytes is None else chunk_bytes // (_JOINED_SHARE * row_bytes)
+    first, held, enough = 0, [], min(_ROWS, rows_of_share)
     for rows, values in blocks():
         own = values[:, some]
-        if memory.chunk_bytes is not None:
-            row_bytes = own.shape[1] * own.itemsize
-            enough = min(_ROWS, memory.chunk_bytes // (_JOINED_SHARE * row_bytes))
         held.append(own if len(own) >= enough else own.clone())  # all other columns may go
         if rows.stop - first >= enough:
             yield slice(first, rows.stop), _joined(held)
@@ -157,7 +157,7 @@ def _products(blocks: Blocks, lift: Tensor | ScratchRows, points: Points) -> Non
     tiles = size if table_bytes is None else table_bytes // (2 * tile_bytes)
     for some in slices(size, max(1, tiles) * _TILE):
         held = lift[some]
-        for block, values in _columns(blocks, some, points.memory):
+        for block, values in _columns(blocks, some, points):
             total = points.rows[block] if some.start else values.new_zeros(len(values), width)
             for tile in _tiles(held):
                 total += steady_product(values[:, tile], held[tile])
@@ -176,7 +176,7 @@ def _images(
     at_once = size if table_bytes is None else max(1, table_bytes // (8 * width))
     for some in slices(size, at_once):
         total = ExactProducts(largest[some], right, points.total, points.processes)
-        for block, values in _columns(blocks, some, points.memory):
+        for block, values in _columns(blocks, some, points):
             total.add(values, points.rows[block])
         images[some] = total.value()
 
