@@ -61,7 +61,19 @@ def rows_of(feature: str, *quick: str) -> Any:
     return pytest.mark.parametrize(("kind", "said"), cases)
 
 
-@functools.cache
+def kept(function: Any) -> Any:
+    """Its results, once each, made with gradients whatever the mode of the test that asks first."""
+
+    @functools.cache
+    @functools.wraps(function)
+    def in_ordinary_mode(*arguments: Any) -> Any:
+        with torch.inference_mode(False), torch.enable_grad():
+            return function(*arguments)
+
+    return in_ordinary_mode
+
+
+@kept
 def glossy() -> TransferTensor:
     """Groups of random points in four exit functions, with frames and reflectances of their own."""
     generator = torch.Generator().manual_seed(0)
@@ -87,14 +99,13 @@ def made(kind: str, transfer: TransferTensor | None = None) -> Relighter:
     return Relighter(KINDS[kind].from_transfer(transfer, **BUDGETS[kind]))
 
 
-@functools.cache
+@kept
 def shared(kind: str) -> Relighter:
-    """One that no test writes to, made outside the inference mode of the test that asks first."""
-    with torch.inference_mode(False):
-        return made(kind)
+    """One that no test writes to."""
+    return made(kind)
 
 
-@functools.cache
+@kept
 def expected(kind: str) -> Tensor:
     return shared(kind)(LIGHT, EYES).detach()
 
