@@ -204,8 +204,7 @@ def principal(
     if kept:
         stiff = singular[:, 0] > stiff_ratio * singular[:, -1]
         if bool(stiff.any()):
-            with one_thread():
-                _, exact, rights = torch.linalg.svd(rows[stiff], full_matrices=False)
+            exact, rights = _exact(rows[stiff])
             singular[stiff], directions[stiff] = exact[:, :kept], rights[:, :kept]
         limit = singular[:, :1] * max(size, dimensions) * torch.finfo(rows.dtype).eps
         used = singular > limit
@@ -213,3 +212,17 @@ def principal(
     padding = rank - kept
     singular = torch.nn.functional.pad(singular * scale[:, 0], (0, padding))
     return singular, torch.nn.functional.pad(directions, (0, 0, 0, padding))
+
+
+def _exact(
+    rows: Float[Tensor, "clusters size d"],
+) -> tuple[Float[Tensor, "clusters least"], Float[Tensor, "clusters least d"]]:
+    """Singular values and right vectors of the points themselves.
+
+    LAPACK's own right vectors can leave the span of equal points by tens of roundings; products
+    of its left vectors with the points do not.
+    """
+    with one_thread():
+        left, singular, _ = torch.linalg.svd(rows, full_matrices=False)
+        rights = torch.linalg.qr((left.mT @ rows).mT)[0].mT
+    return singular, rights
