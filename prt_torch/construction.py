@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from prt_torch.metric import Metric
-from prt_torch.representations import Representation
+from prt_torch.representations import CPCA, ClusteredTensor, Representation, ZonalLobes
 from prt_torch.representations.files import KINDS
 from prt_torch.transfer import TransferTensor
 
@@ -57,3 +57,30 @@ def closed_form(problem: Problem, kind: str, parameters: Parameters) -> Represen
         case "cpca" if _CPCA_COPIES * problem.transfer.num_bytes > problem.memory_budget:
             common["memory_budget"] = problem.memory_budget  # in chunks: slower, the same result
     return KINDS[kind].from_transfer(problem.transfer, **parameters, **common)
+
+
+_NUMBERS: dict[str, Parameters] = {
+    "cpca": {"quantisation_share": None},
+    "clustered_tensor": {"quantisation_share": None, "bits": None},
+    "zonal_lobes": {"quantisation_share": None, "bits": None},
+}
+"""What keeps numbers as they are, of kinds that can be put in compressed codes."""
+
+
+def before_codes(kind: str, parameters: Parameters) -> Parameters:
+    """Parameters of the closed form whose numbers these compress; the same if they do not."""
+    share = parameters.get("quantisation_share")
+    compressed = kind in _NUMBERS and share is not None
+    return {**parameters, **_NUMBERS[kind]} if compressed else parameters
+
+
+def in_codes(problem: Problem, model: Representation, parameters: Parameters) -> Representation:
+    """A closed form of :func:`before_codes` in compressed codes: that of these parameters.
+
+    Raises:
+        ValueError: If the kind cannot be compressed.
+    """
+    if not isinstance(model, CPCA | ClusteredTensor | ZonalLobes):
+        raise ValueError(f"expected one of {', '.join(_NUMBERS)} to compress, got {model.kind}")
+    share = parameters["quantisation_share"]
+    return model.coded(problem.transfer, share=share, metric=problem.metric)

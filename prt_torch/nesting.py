@@ -7,6 +7,10 @@ after it. Fits of falling size add up to few of the largest: a chain of 20 point
 three of them. How far a fit reaches is a compromise, of each kind, between that and what reading
 loses (docs/sweeps.md). Kinds and options that cannot be read off are fitted one by one.
 
+Compressed codes are made of numbers, and a fit of numbers serves all codes. So the points of a
+chain may also differ by their codes: each is read off the fit of its numbers, or of more of them,
+and then compressed.
+
 What is fitted and what is read follows from the chain alone, so a chain that was stopped goes on as
 if it had not been.
 """
@@ -17,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from prt_torch.construction import Parameters, Problem, closed_form
+from prt_torch.construction import Parameters, Problem, before_codes, closed_form, in_codes
 from prt_torch.reductions import (
     fewer_functions,
     fewer_segment_vectors,
@@ -34,6 +38,8 @@ from prt_torch.representations import (
     WaveletTransfer,
 )
 
+_SHARE = "quantisation_share"
+
 
 @dataclass(frozen=True)
 class Nesting:
@@ -44,25 +50,18 @@ class Nesting:
         reach: How many times smaller than what was fitted a point may be.
         read: Makes the point of these parameters from the fitted one.
         unless: Values of other parameters that rule it out.
-        without: Parameters that rule it out where they are given.
     """
 
     axis: str
     reach: float
     read: Callable[[Any, Parameters, Problem], Representation]
     unless: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    without: Sequence[str] = ()
 
-    def applies(self, parameters: Parameters) -> bool:
-        """Whether representations with these parameters can be read off."""
-        given = any(parameters.get(name) is not None for name in self.without)
-        return not given and not any(
-            parameters.get(name) in ruled for name, ruled in self.unless.items()
-        )
-
-    def within_reach(self, smaller: Any, fitted: Any) -> bool:
-        """Whether a value of the axis is near enough below a fitted one."""
-        pairs = list(zip(_sizes(smaller), _sizes(fitted), strict=True))
+    def reaches(self, wanted: Parameters, fitted: Parameters) -> bool:
+        """Whether a point can be read off, and is near enough below, what was fitted."""
+        if any(wanted.get(name) in ruled for name, ruled in self.unless.items()):
+            return False
+        pairs = list(zip(_sizes(wanted[self.axis]), _sizes(fitted[self.axis]), strict=True))
         return all(small <= large <= self.reach * small for small, large in pairs)
 
 
@@ -93,8 +92,8 @@ def _read_segments(model: SegmentedCPCA, wanted: Parameters, problem: Problem) -
 
 
 NESTINGS: dict[str, Nesting] = {
-    "cpca": Nesting("rank", 1.6, _read_cpca, {"method": ["adaptive"]}, ("quantisation_share",)),
-    "clustered_tensor": Nesting("ranks", 3.0, _read_tensor, without=("quantisation_share",)),
+    "cpca": Nesting("rank", 1.6, _read_cpca, {"method": ["adaptive"]}),
+    "clustered_tensor": Nesting("ranks", 3.0, _read_tensor),
     "scattered_srbf": Nesting("num_functions", 3.0, _read_functions),
     "segmented_cpca": Nesting("rank", 2.0, _read_segments),
     "wavelet": Nesting("num_terms", float("inf"), _read_terms),
@@ -104,39 +103,46 @@ NESTINGS: dict[str, Nesting] = {
 
 @dataclass(frozen=True)
 class Chain:
-    """Points of one kind that share all parameters but one.
+    """Points of one kind that share all parameters but one, and the codes that they are put in.
 
     Attributes:
         kind: Of :data:`prt_torch.representations.files.KINDS`.
         fixed: What all points share.
-        axis: The parameter that differs; None where there is one point.
+        axis: The parameter that differs; None where there is one value of all.
         values: Of the axis, the largest first.
+        shares: Values of ``quantisation_share``, None first; of no elements where it does not
+            differ.
     """
 
     kind: str
     fixed: Parameters
     axis: str | None = None
     values: tuple[Any, ...] = ()
+    shares: tuple[float | None, ...] = ()
 
     def points(self) -> list[Parameters]:
         """Parameters of every point, in the order they are made."""
-        if self.axis is None:
-            return [dict(self.fixed)]
-        return [{**self.fixed, self.axis: value} for value in self.values]
+        axes = [] if self.axis is None else [{self.axis: value} for value in self.values]
+        codes = [{_SHARE: share} for share in self.shares]
+        pairs = itertools.product(axes or [{}], codes or [{}])
+        return [{**self.fixed, **along, **share} for along, share in pairs]
 
-    def plan(self) -> list[tuple[Parameters, Parameters | None]]:
-        """Every point with the fitted one it is read off; None where it is fitted itself."""
+    def plan(self) -> list[tuple[Parameters, Parameters]]:
+        """Every point with the fit that it is read off; its own, if that is fitted for it."""
         nesting, planned, fitted = NESTINGS.get(self.kind), [], None
         for wanted in self.points():
-            near = (
-                nesting is not None
-                and fitted is not None
-                and nesting.applies(wanted)
-                and nesting.within_reach(wanted[nesting.axis], fitted[nesting.axis])
-            )
-            planned.append((wanted, fitted if near else None))
-            fitted = fitted if near else wanted
+            numbers = before_codes(self.kind, wanted)
+            if fitted is None or not (
+                numbers == fitted or (nesting is not None and nesting.reaches(numbers, fitted))
+            ):
+                fitted = numbers
+            planned.append((wanted, fitted))
         return planned
+
+    def read_off(self, wanted: Parameters, fitted: Parameters) -> Parameters | None:
+        """The fit whose numbers a point has some of; None where it has all of them."""
+        smaller = self.axis is not None and wanted[self.axis] != fitted[self.axis]
+        return fitted if smaller else None
 
 
 def chains(kind: str, grid: Mapping[str, Sequence[Any]]) -> list[Chain]:
@@ -148,16 +154,26 @@ def chains(kind: str, grid: Mapping[str, Sequence[Any]]) -> list[Chain]:
     """
     nesting = NESTINGS.get(kind)
     axis = nesting.axis if nesting and nesting.axis in grid else None
-    others = [name for name in grid if name != axis]
-    found = []
-    for choice in itertools.product(*(grid[name] for name in others)):
-        fixed = dict(zip(others, choice, strict=True))
-        if axis is None:
-            found.append(Chain(kind, fixed))
-            continue
-        values = sorted(grid[axis], key=_sizes, reverse=True)
-        found.append(Chain(kind, fixed, axis, tuple(values)))
-    return found
+    values = sorted(grid[axis], key=_sizes, reverse=True) if axis else []
+    codes = _codes(kind, grid.get(_SHARE, []))
+    others = [name for name in grid if name != axis and not (any(codes) and name == _SHARE)]
+    return [
+        Chain(kind, dict(zip(others, choice, strict=True)), axis, tuple(values), shares)
+        for choice in itertools.product(*(grid[name] for name in others))
+        for shares in codes
+    ]
+
+
+def _codes(kind: str, shares: Sequence[float | None]) -> list[tuple[float | None, ...]]:
+    """Shares whose points are made of the same numbers; one empty group if codes do not differ."""
+    numbers = before_codes(kind, {_SHARE: 1.0})
+    if not shares or numbers[_SHARE] is not None:
+        return [()]
+    coded = tuple(sorted(share for share in shares if share is not None))
+    plain = (None,) if None in shares else ()
+    if numbers == {_SHARE: None}:  # what is not compressed keeps these numbers
+        return [plain + coded]
+    return [group for group in (plain, coded) if group]
 
 
 @dataclass(frozen=True)
@@ -167,16 +183,30 @@ class Made:
     Attributes:
         parameters: Of the point.
         model: The representation.
-        read_off: Parameters of the fitted point it was read off; None where it was fitted.
-        seconds: To make it, the fit that it was read off aside.
-        condition: Of the fit, which a file does not keep.
+        fitted: Parameters of the fit that it was read off; its own where it was fitted itself.
+        read_off: The same; None where it has all numbers of that fit.
+        seconds: That it took, with the fit if that was made for it.
+        fit_seconds: As if the fit had been made for it alone; None where the fit was kept from
+            before.
+        condition: Which a file does not keep; NaN where the fit was kept from before.
     """
 
     parameters: Parameters
     model: Representation
+    fitted: Parameters
     read_off: Parameters | None
     seconds: float
+    fit_seconds: float | None
     condition: float
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What points are read off."""
+
+    parameters: Parameters
+    model: Representation
+    seconds: float | None
 
 
 def nested(
@@ -199,18 +229,36 @@ def nested(
         ValueError: If the transfer or a parameter does not suit the kind.
         InputError: If a fit would take more than the memory budget.
     """
-    source: tuple[Parameters, Representation] | None = None
-    for wanted, read_off in chain.plan():
+    fit: _Fit | None = None
+    for wanted, source in chain.plan():
         if done(wanted):
             continue
-        if read_off is not None and (source is None or source[0] != read_off):
-            source = read_off, fitted(read_off) or closed_form(problem, chain.kind, read_off)
         start = time.perf_counter()
-        if read_off is None or source is None:
-            model = closed_form(problem, chain.kind, wanted)
-        else:
-            model = NESTINGS[chain.kind].read(source[1], wanted, problem)
-        seconds = time.perf_counter() - start
-        yield Made(wanted, model, read_off, seconds, model.condition)
-        if read_off is None:  # as it was kept, so that a chain that was stopped reads the same
-            source = wanted, fitted(wanted) or model
+        if fit is None or fit.parameters != source:
+            fit = _fit(problem, chain.kind, source, fitted)
+        begun = time.perf_counter()
+        read_off = chain.read_off(wanted, source)
+        model = fit.model
+        if read_off is not None:
+            model = NESTINGS[chain.kind].read(model, wanted, problem)
+        if before_codes(chain.kind, wanted) != wanted:
+            model = in_codes(problem, model, wanted)
+        ended = time.perf_counter()
+        own = None if fit.seconds is None else fit.seconds + ended - begun
+        yield Made(wanted, model, source, read_off, ended - start, own, model.condition)
+        if wanted == source:  # as it was kept, so that a chain that was stopped reads the same
+            fit = _Fit(source, fitted(source) or model, fit.seconds)
+
+
+def _fit(
+    problem: Problem,
+    kind: str,
+    parameters: Parameters,
+    fitted: Callable[[Parameters], Representation | None],
+) -> _Fit:
+    kept = fitted(parameters)
+    if kept is not None:
+        return _Fit(parameters, kept, None)
+    start = time.perf_counter()
+    model = closed_form(problem, kind, parameters)
+    return _Fit(parameters, model, time.perf_counter() - start)

@@ -202,20 +202,62 @@ def test_twenty_points_cost_at_most_three_of_the_largest(kind):
     axis = NESTINGS[kind].axis
     values = [[k, 2 * k, k] for k in range(1, 21)] if axis == "ranks" else list(range(1, 21))
     (chain,) = chains(kind, {axis: values})
-    fits = [point[axis] for point, read_off in chain.plan() if read_off is None]
+    fits = [point[axis] for point, fitted in chain.plan() if fitted == point]
     sizes = [fit[0] if axis == "ranks" else fit for fit in fits]
     assert sum(sizes) <= 3 * 20
     if kind in ("clustered_tensor", "scattered_srbf", "wavelet"):
         assert len(fits) <= 3
-    for point, read_off in chain.plan():
-        if read_off is not None:
-            assert NESTINGS[kind].within_reach(point[axis], read_off[axis])
+    for point, fitted in chain.plan():
+        assert fitted == point or NESTINGS[kind].reaches(point, fitted)
 
 
 def test_points_that_cannot_be_read_off_are_fitted():
     grid = {"method": ["adaptive"], "num_clusters": [4], "rank": [3, 2]}
     (chain,) = chains("cpca", grid)
-    assert all(read_off is None for _, read_off in chain.plan())
+    assert all(fitted == point for point, fitted in chain.plan())
+
+
+def test_codes_of_all_shares_are_made_of_the_same_fits():
+    grid = {"num_clusters": [4], "rank": [8, 7, 2], "quantisation_share": [4, None, 1]}
+    (chain,) = chains("cpca", grid)
+    assert [point["quantisation_share"] for point in chain.points()[:3]] == [None, 1, 4]
+    assert [fitted["rank"] for _, fitted in chain.plan()] == [8] * 6 + [2] * 3
+    assert all(fitted["quantisation_share"] is None for _, fitted in chain.plan())
+    # What is not compressed has codes of 16 bits here, which compressed ones are not made of.
+    tensors = chains("clustered_tensor", {"ranks": [[1, 2, 2]], "quantisation_share": [None, 1, 4]})
+    assert [one.shares for one in tensors] == [(None,), (1, 4)]
+    ((_, fitted), _) = tensors[1].plan()
+    assert fitted == {"ranks": [1, 2, 2], "quantisation_share": None, "bits": None}
+    lobes = chains("zonal_lobes", {"num_lobes": [1, 2], "quantisation_share": [1, 4]})
+    assert [one.points() for one in lobes] == [
+        [{"num_lobes": count, "quantisation_share": share} for share in (1, 4)] for count in (1, 2)
+    ]
+    # The share of this kind is that of its own codes.
+    (segments,) = chains("segmented_cpca", {"rank": [2, 1], "quantisation_share": [0.05]})
+    assert segments.fixed == {"quantisation_share": 0.05}
+
+
+@pytest.mark.parametrize("kind", ["cpca", "clustered_tensor", "zonal_lobes"])
+def test_codes_of_a_chain_are_those_of_own_fits(kind):
+    """Of the largest point, whose numbers are its own; smaller ones are near, in fewer bytes."""
+    problem = Problem(smooth_transfer(120))
+    grids = {
+        "cpca": {"num_clusters": [4], "rank": [4, 3]},
+        "clustered_tensor": {"num_clusters": [4], "ranks": [[1, 5, 5], [1, 4, 4]]},
+        "zonal_lobes": {"num_lobes": [1], "effort": ["fast"]},
+    }
+    (chain,) = chains(kind, {**grids[kind], "quantisation_share": [1, 4]})
+    made = list(nested(problem, chain))
+    for one in made:
+        own = closed_form(problem, kind, one.parameters)
+        errors = [evaluate.transfer_error(model, problem.transfer) for model in (one.model, own)]
+        sizes = [sum(model.storage().values()) for model in (one.model, own)]
+        assert errors[0] == pytest.approx(errors[1], rel=1e-3 if one.read_off is None else 1.0)
+        assert sizes[0] == pytest.approx(sizes[1], rel=0.01 if one.read_off is None else 0.2)
+        assert one.model.condition == pytest.approx(own.condition, rel=1.0)
+    assert [one.read_off is None for one in made[:2]] == [True, True]
+    assert all(one.read_off for one in made[2:])
+    assert made[0].seconds > made[1].seconds  # which has no fit of its own
 
 
 @pytest.mark.parametrize("kind", ["cpca", "clustered_tensor", "scattered_srbf", "wavelet"])
@@ -260,10 +302,13 @@ def contents(folder: Path) -> dict[str, object]:
     return found
 
 
+@pytest.mark.parametrize("shares", [[None], [None, 1], [1, 4]])
 @pytest.mark.parametrize("stop_after", [0, 1, 3])
-def test_killed_chain_ends_as_if_it_had_not_been(tmp_path, monkeypatch, stop_after):
+def test_killed_chain_ends_as_if_it_had_not_been(tmp_path, monkeypatch, stop_after, shares):
     problem, judge = Problem(smooth_transfer(150)), judge_of(smooth_transfer(150))
-    (chain,) = chains("cpca", {"num_clusters": [4], "rank": [8, 7, 6, 5, 2, 1]})
+    ranks = [8, 7, 6, 5, 2, 1] if shares == [None] else [8, 7, 2]
+    grid = {"num_clusters": [4], "rank": ranks, "quantisation_share": shares}
+    (chain,) = chains("cpca", grid)
     assert run_chain(problem, chain, Kept(tmp_path / "whole"), judge) == 6
     keep, kept = Kept.keep, []
 

@@ -16,7 +16,10 @@ from torch import Tensor, nn
 
 from prt_torch.metric import Metric
 from prt_torch.representations.palette import reflectance_bytes
+from prt_torch.representations.processes import ALONE, Processes
 from prt_torch.transfer import Surface, TransferTensor
+
+_BLOCK_BYTES = 2**25
 
 
 class Representation(nn.Module, ABC):
@@ -186,6 +189,17 @@ class CodedRepresentation(Representation):
     @abstractmethod
     def _rounded(self) -> dict[str, Tensor]:
         """The parameters by name, at what a file would hold."""
+
+    def _squared_error(
+        self, transfer: TransferTensor, metric: Metric, processes: Processes = ALONE
+    ) -> float:
+        """Against transfer, read once by blocks, over the points of all processes."""
+        every = torch.arange(self.num_points, device=self.reflectance.device)
+        error = torch.zeros(1, dtype=torch.float64, device=every.device)
+        for rows, values in transfer.blocks(_BLOCK_BYTES):
+            lost = metric.weigh(self.dense(every[rows]).double() - values)
+            error += lost.square().sum().to(error)
+        return float(processes.sum(error))
 
     def train(self, mode: bool = True) -> "CodedRepresentation":
         """Enter training; on leaving it, round the parameters to what a file holds."""

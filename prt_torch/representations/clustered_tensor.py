@@ -190,21 +190,55 @@ class ClusteredTensor(CodedRepresentation):
         encoding, statistics = encode(
             transfer, num_clusters=num_clusters, ranks=wanted, options=options
         )
-        coding = None
-        if quantisation_share is not None:
-            coding = coding_for(
-                encoding,
-                statistics.squared_error,
-                share=quantisation_share,
-                metric=options.metric.in_float32(),
-                processes=processes,
-            )
-        elif bits is not None:
+        if bits is not None and quantisation_share is None:
             encoding = encoding.coded(processes)
-        found = cls(encoding, transfer.surface, tuple(transfer.values.shape), coding)
+        found = cls(encoding, transfer.surface, tuple(transfer.values.shape))
         found.statistics = statistics
         if len(found.labels) * _TABLE_BYTES <= memory_budget // 16:
             found._blocks = found.blocks  # which no compiler can trace
+        if quantisation_share is None:
+            return found
+        error = statistics.squared_error
+        return found._compressed(error, quantisation_share, options.metric, processes)
+
+    @torch.no_grad()
+    def coded(
+        self,
+        transfer: TransferTensor,
+        *,
+        share: float,
+        metric: Metric | None = None,
+        process_group: distributed.ProcessGroup | None = None,
+    ) -> "ClusteredTensor":
+        """The same in compressed codes.
+
+        Args:
+            transfer: What it stands for; read once. With a ``process_group``, the points of this
+                process.
+            share: Of the squared error, which codes may add; down to what 15 bits do.
+            metric: The one it was made in; the L2 norm over light directions if not given.
+            process_group: As in :meth:`from_transfer`.
+
+        Raises:
+            ValueError: If the share is not positive.
+        """
+        if not share > 0.0:
+            raise ValueError(f"expected a positive share, got {share}")
+        metric, processes = metric or Metric.l2(transfer), Processes(process_group)
+        error = self._squared_error(transfer, metric, processes)
+        return self._compressed(error, share, metric, processes)
+
+    @torch.no_grad()
+    def _compressed(
+        self, error: float, share: float, metric: Metric, processes: Processes
+    ) -> "ClusteredTensor":
+        """In codes that may add a share of a squared error over the points of all processes."""
+        encoding = replace(self._encoding(), steps=None)
+        coding = coding_for(
+            encoding, error, share=share, metric=metric.in_float32(), processes=processes
+        )
+        found = ClusteredTensor(encoding, self.surface, self.shape, coding)
+        found.statistics, found._blocks = self.statistics, self._blocks
         return found
 
     def _rounded(self) -> dict[str, Tensor]:

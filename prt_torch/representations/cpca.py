@@ -37,7 +37,6 @@ from prt_torch.representations.grouped import ClusterBlocks
 from prt_torch.representations.processes import Processes
 from prt_torch.transfer import Surface, TransferTensor
 
-_BLOCK_BYTES = 2**25
 _TABLE_BYTES = 64  # a point, of tables for evaluation, and four a weight
 
 
@@ -195,15 +194,10 @@ class CPCA(CodedRepresentation):
         if not share > 0.0:
             raise ValueError(f"expected a positive share, got {share}")
         metric, processes = metric or Metric.l2(transfer), Processes(process_group)
-        error = torch.zeros(1, dtype=torch.float64)
-        every = torch.arange(self.num_points, device=self.labels.device)
-        for rows, values in transfer.blocks(_BLOCK_BYTES):
-            lost = metric.weigh(self.dense(every[rows]).double() - values)
-            error += lost.square().sum().cpu()
         encoding, coding = coded(
             self._encoding(),
             self.shape[1:],
-            float(processes.sum(error.to(self.labels.device))),
+            self._squared_error(transfer, metric, processes),
             share=share,
             metric=metric.in_float32(),
             processes=processes,

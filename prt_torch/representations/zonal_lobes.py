@@ -167,26 +167,47 @@ class ZonalLobes(CodedRepresentation):
         axes = found.axes.unflatten(0, values.shape[:2]).to(values)
         axes = axes if bits is None else on_codes(axes)
         lobes = _solved(values, axes, ridge, own_linear)
-        if edges is not None:
-            lobes = corresponding(lobes, values, edges)
+        lobes = by_strength(lobes) if edges is None else corresponding(lobes, values, edges)
         steps = None if bits is None else lobes.steps()
-        lobes, coding = lobes if steps is None else lobes.rounded(steps), None
-        if quantisation_share is not None:
-            lobes, coding = coded(
-                lobes if edges is not None else by_strength(lobes),
-                values,
-                share=quantisation_share,
-                metric=(metric or Metric.l2(transfer)).in_float32(),
-                order=_order(transfer.surface, transfer.num_coeffs),
-            )
-        model = cls(lobes, steps, transfer.surface, tuple(transfer.values.shape), coding)
+        lobes = lobes if steps is None else lobes.rounded(steps)
+        model = cls(lobes, steps, transfer.surface, tuple(transfer.values.shape))
         model._condition = _worst_condition(lobes, model.order, ridge)
+        if quantisation_share is not None:
+            model = model.coded(transfer, share=quantisation_share, metric=metric)
         model.statistics = {
-            "largest_coefficient": _largest(lobes.coefficients),
+            "largest_coefficient": _largest(model.coefficients.detach()),
             **{name: getattr(found, name) for name in ("starts", "steps", "unfinished")},
             "seconds": time.perf_counter() - start,
         }
         return model
+
+    @torch.no_grad()
+    def coded(
+        self, transfer: TransferTensor, *, share: float, metric: Metric | None = None
+    ) -> "ZonalLobes":
+        """The same in compressed codes: axes at theirs, numbers fitted anew there.
+
+        Args:
+            transfer: What it stands for.
+            share: Of the squared error in the metric, which codes may add; down to what 15 bits do.
+            metric: What errors are worth; the L2 norm over light directions if not given.
+
+        Raises:
+            ValueError: If the share is not positive.
+        """
+        if not share > 0.0:
+            raise ValueError(f"expected a positive share, got {share}")
+        values = transfer.dense().flatten(1, 2)
+        lobes, coding = coded(
+            self._values(),
+            values.to(torch.promote_types(values.dtype, torch.float32)),
+            share=share,
+            metric=(metric or Metric.l2(transfer)).in_float32(),
+            order=self.order,
+        )
+        found = ZonalLobes(lobes, None, self.surface, self.shape, coding)
+        found._condition, found.statistics = self._condition, self.statistics
+        return found
 
     @property
     def num_lobes(self) -> int:

@@ -6,6 +6,7 @@ is worth; a job that is started again makes only what has no record. Points are 
 as their files hold them, so a chain that was stopped ends as if it had not been.
 """
 
+import math
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -85,7 +86,9 @@ def run_chain(problem: Problem, chain: Chain, kept: Kept, judge: Judge) -> int:
         done=lambda parameters: kept.record(chain.kind, parameters) is not None,
         fitted=lambda parameters: kept.model(chain.kind, parameters),
     ):
-        before = made.read_off and kept.record(chain.kind, made.read_off)
+        before = kept.record(chain.kind, made.fitted) or {}
+        condition = before.get("condition") if math.isnan(made.condition) else made.condition
+        own = made.fit_seconds
         kept.keep(
             chain.kind,
             made,
@@ -97,8 +100,8 @@ def run_chain(problem: Problem, chain: Chain, kept: Kept, judge: Judge) -> int:
                 "status": "closed_form",
                 "read_off": made.read_off,
                 "seconds": made.seconds,
-                "fit_seconds": made.seconds + (before["fit_seconds"] if before else 0.0),
-                "condition": made.condition if made.condition < float("inf") else None,
+                "fit_seconds": made.seconds + before["fit_seconds"] if own is None else own,
+                "condition": None if condition == math.inf else condition,
                 **judge.errors(made.model),
             },
         )
@@ -148,7 +151,8 @@ def do(work: dict[str, Any]) -> str | None:
     A chain that does not suit the scene is no reason to stop the others.
     """
     given = work["chain"]
-    chain = Chain(given["kind"], given["fixed"], given["axis"], tuple(given["values"]))
+    values, shares = tuple(given["values"]), tuple(given["shares"])
+    chain = Chain(given["kind"], given["fixed"], given["axis"], values, shares)
     with nullcontext() if work["alone"] else one_thread():
         try:
             inputs, problem = prepare(RunConfig.model_validate(work["run"]))

@@ -23,7 +23,7 @@ from torch import Tensor
 from prt_torch import evaluate
 from prt_torch.baking import bake
 from prt_torch.bases import CubeDirections
-from prt_torch.construction import Parameters, Problem, closed_form
+from prt_torch.construction import Parameters, Problem, before_codes, closed_form, in_codes
 from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
@@ -108,7 +108,9 @@ def _models(problem: Problem, kind: str, parameters: Parameters) -> dict[str, Re
         found["clusters"] = closed_form(problem, kind, {**uncoded, **_LEAST[kind]})
     name = "rank" if kind in _LEAST else kind
     found[name] = closed_form(problem, kind, uncoded)
-    if _named(kind, uncoded) != _named(kind, parameters):
+    if before_codes(kind, parameters) != parameters:
+        found["codes"] = in_codes(problem, found[name], parameters)
+    elif _named(kind, uncoded) != _named(kind, parameters):
         found["codes"] = closed_form(problem, kind, parameters)
     return found
 
