@@ -416,6 +416,7 @@ def test_nothing_that_suits_is_an_error(small_scene, tmp_path):
         ("sweep=none", "sweep: unknown 'none'; expected one of"),
         ("sweep.workrs=2", "sweep.workrs: unknown key"),
         ("sweep.workers", "not KEY=VALUE"),
+        ("sweep.workers=[1", r"sweep.workers=\[1: line 1, column 3: expected ',' or '\]'"),
         ("sweep.representations=[{name: cpcb}]", "representations.0.name: expected one of cpca"),
         ("sweep.representations=[{name: cpca, rnk: 1}]", "0.rnk: unknown key; expected one of"),
         ("sweep.representations=[{name: cpca, rank: [2, 0]}]", "0.rank: .* equal to 1, got '0'"),
