@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from prt_torch import store
 from prt_torch.assets import (
     Environment,
     Mesh,
@@ -13,7 +14,7 @@ from prt_torch.assets import (
     procedural_scene,
 )
 from prt_torch.assets.brdf import brdf
-from prt_torch.assets.material import Material, split_borders
+from prt_torch.assets.material import Material, assign_materials, split_borders
 from prt_torch.assets.medium import PRESETS
 from prt_torch.baking import check_memory
 from prt_torch.bases import SRBF, CubeDirections, Haar, LightBasis, SphericalHarmonics
@@ -42,6 +43,15 @@ class Inputs:
             f"{', '.join(names[:3])}{f' and {len(names) - 3} more' if names[3:] else ''}: {words}"
             for words, names in parts.items()
         )
+
+    def digest(self) -> str:
+        """SHA-256 of what the files held: surface, materials of points, and light."""
+        mesh, lights = self.mesh, [*self.fit_lights, *self.test_lights]
+        surface = (mesh.vertices, mesh.faces, mesh.normals, mesh.albedo)
+        found, of_points = assign_materials(mesh, self.materials)
+        glossy = [made_of.glossy and made_of.glossy.describe() for made_of in found]
+        light = (part for one in lights for part in (one.image, one.rotation))
+        return store.digest(*surface, glossy, of_points, *light)
 
 
 def _words(material: Material) -> str:

@@ -136,11 +136,7 @@ def _load(config: RunConfig) -> Inputs:
 
 def _claim(config: RunConfig, inputs: Inputs) -> str:
     """What the results of a run follow from: its configuration, and what the files held."""
-    mesh, lights = inputs.mesh, [*inputs.fit_lights, *inputs.test_lights]
-    surface = (mesh.vertices, mesh.faces, mesh.normals, mesh.albedo)
-    light = (part for one in lights for part in (one.image, one.rotation))
-    hashed = store.digest(*surface, *light)
-    return f"# inputs {hashed}\n{OmegaConf.to_yaml(OmegaConf.create(_identity(config)))}"
+    return f"# inputs {inputs.digest()}\n{OmegaConf.to_yaml(OmegaConf.create(_identity(config)))}"
 
 
 def _check_folder(out: Path, config: RunConfig, inputs: Inputs) -> None:
