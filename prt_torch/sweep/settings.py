@@ -129,6 +129,11 @@ def parse_sweep(arguments: list[str], config_dir: Path, *, script: str) -> Sweep
     except ValidationError as error:
         raise InputError(_first_problem(error)) from error
     found.sweep.grids()
+    if found.sweep.waterfall and base.transfer.max_bounces and base.material.is_glossy:
+        raise InputError(
+            "sweep.waterfall: its truth is light by texels, in which glossy materials bounce no "
+            "light; set it to false, or transfer.max_bounces=0"
+        )
     return found
 
 
