@@ -665,6 +665,7 @@ class TestReport:
 
     def test_unknown_option(self, capfd):
         refuse(capfd, REPORT, ["run", "--output=all"], "--output=all", "usage: ")
+        refuse(capfd, REPORT, ["run", "--out=./run"], "--out=run", "own report would be lost")
 
     def test_two_runs(self, capfd, finished):
         write("ball.obj", obj())
