@@ -20,6 +20,7 @@ from prt_torch.baking import check_memory
 from prt_torch.bases import SRBF, CubeDirections, Haar, LightBasis, SphericalHarmonics
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
+from prt_torch.metric import MAX_PRIOR_COEFFS
 from prt_torch.settings import LightConfig, PartConfig, RunConfig, SceneConfig
 
 
@@ -78,6 +79,11 @@ def load_inputs(config: RunConfig) -> Inputs:
     )
     if config.fit.metric == "light_prior" and not inputs.fit_lights:
         raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
+    if config.fit.metric == "light_prior" and basis.num_coeffs > MAX_PRIOR_COEFFS:
+        raise InputError(
+            f"fit.metric: light_prior takes at most {MAX_PRIOR_COEFFS} light coefficients, "
+            f"{basis.name} has {basis.num_coeffs}"
+        )
     names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
