@@ -33,6 +33,8 @@ def report(arguments: list[str]) -> None:
             runs.append(Path(argument))
     if not runs or len({run.resolve() for run in runs}) < len(runs):
         raise InputError(f"expected one or more different run folders, got {len(runs)}; {USAGE}")
+    if out.resolve() in {run.resolve() for run in runs}:
+        raise InputError(f"--out={out}: is one of the runs, whose own report would be lost")
     reports = [_read(run / "report.json") for run in runs]
     gathered = gather(reports, names=[str(run) for run in runs])
     with store.locked(out, what="output folder"):

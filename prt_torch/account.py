@@ -28,7 +28,6 @@ from prt_torch.transfer import TransferTensor
 PICTURES = "pictures"  # folder of them inside a run folder
 _ALL_BUT_ONE = 24  # functions of order 5 without the best replaced one
 _VIEWS = 6  # around the scene, that errors of glossy transfer are averaged over
-_DENSE_BLOCK_POINTS = 2000  # timed and scaled up when the whole tensor does not fit
 _NO_OPENGL = {
     "what": "the OpenGL preview",
     "why": "not asked for, or no EGL here; the ray-cast pictures are exact anyway",
@@ -140,14 +139,12 @@ def _time(
     memory_budget: int,
 ) -> tuple[dict[str, float], float, bool]:
     """Seconds to relight by each result and by the tensor itself, measured in turn."""
-    scaled = transfer.num_bytes > memory_budget // 2
-    points = _DENSE_BLOCK_POINTS if scaled else transfer.num_points
-    dense = Relighter(DenseTransfer.from_transfer(transfer.block(slice(0, points))))
+    block, factor = evaluate.timed_block(transfer, memory_budget)
+    dense = Relighter(DenseTransfer.from_transfer(block))
     calls = [lambda relight=relight: relight(light[None], view) for relight in relighters.values()]
     with torch.no_grad():
         *taken, dense_taken = evaluate.median_seconds([*calls, lambda: dense(light[None], view)])
-    factor = transfer.num_points / points
-    return dict(zip(relighters, taken, strict=True)), dense_taken * factor, scaled
+    return dict(zip(relighters, taken, strict=True)), dense_taken * factor, factor > 1
 
 
 def facts(inputs: Inputs, transfer: TransferTensor) -> dict[str, Any]:

@@ -251,11 +251,16 @@ def _best_of_kinds(tried: Iterable[Tried], limits: Limits) -> dict[str, Tried]:
 
 
 def _between(tried: Sequence[Tried], best: Tried, limits: Limits) -> list[Parameters]:
-    """Parameters between one that keeps the limits and a next that does not, on lines near by."""
+    """Parameters between one that keeps the limits and a next that does not, on lines near by.
+
+    Sizes alone are followed: candidates whose other parameters are not the best's are not on its
+    lines.
+    """
+    tried = [one for one in tried if _choices(one) == _choices(best)]
     tuned = [
         name
         for name, value in best.parameters.items()
-        if not isinstance(value, str) and any(one.parameters[name] != value for one in tried)
+        if any(one.parameters[name] != value for one in tried)
     ]
     proposed = []
     for name in tuned:
@@ -289,6 +294,17 @@ def _values_near(best: Tried, name: str, tried: Sequence[Tried], count: int) -> 
 
 def _near(one: Tried, best: Tried, name: str, tried: Sequence[Tried]) -> bool:
     return one.parameters[name] in _values_near(best, name, tried, _NEIGHBOURS)
+
+
+def _choices(one: Tried) -> Parameters:
+    """Its parameters; of a size, only that there is one."""
+    return {k: "a size" if _is_size(value) else value for k, value in one.parameters.items()}
+
+
+def _is_size(value: Any) -> bool:
+    """Whether a parameter is a whole number, or a list of them: there are others between two."""
+    parts = value if isinstance(value, list | tuple) else [value]
+    return all(type(part) is int for part in parts)
 
 
 def _size(value: Any) -> float:

@@ -19,6 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import ValidationError
+from yaml import MarkedYAMLError, YAMLError
 
 from prt_torch.errors import InputError
 from prt_torch.settings import KINDS, RunConfig
@@ -81,7 +82,7 @@ def load_config(config_dir: Path, name: str, overrides: list[str]) -> RunConfig:
     try:
         content = OmegaConf.to_container(composed, resolve=True)
     except OmegaConfBaseException as error:
-        raise InputError(f"configuration: {_first_line(error)}") from error
+        raise InputError(f"configuration: {first_line(error)}") from error
     if isinstance(content, dict):
         named = content.get("representations")
         if isinstance(named, list):
@@ -101,7 +102,7 @@ def _compose(config_dir: Path, name: str, overrides: list[str]) -> Any:
     try:
         with initialize_config_dir(str(config_dir.resolve()), version_base="1.3"):
             return compose(name, overrides=forced)
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError, ValueError) as error:
         raise InputError(f"configuration: {_explain(error)}") from error
 
 
@@ -155,7 +156,7 @@ def _grid_points(overrides: list[str]) -> list[list[str]]:
         try:
             values = list(parsed.sweep_string_iterator())
         except HydraException as error:
-            raise InputError(f"{override}: {_first_line(error)}") from error
+            raise InputError(f"{override}: {first_line(error)}") from error
         choices.append([f"{parsed.get_key_element()}={value}" for value in values])
     return [list(point) for point in itertools.product(*choices)]
 
@@ -168,7 +169,10 @@ def _by_name(config_dir: Path, entry: Any) -> Any:
     if not file.is_file():
         choices = ", ".join(sorted(path.stem for path in file.parent.glob("*.yaml")))
         raise InputError(f"representations: unknown {entry!r}; expected one of {choices}")
-    return OmegaConf.to_container(OmegaConf.load(file), resolve=True)
+    try:
+        return OmegaConf.to_container(OmegaConf.load(file), resolve=True)
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise InputError(f"representations: {entry}: {first_line(error)}") from error
 
 
 def _explain(error: Exception) -> str:
@@ -179,10 +183,15 @@ def _explain(error: Exception) -> str:
         options = re.findall(r"^\t(\w+)$", text.partition("Available options")[2], re.MULTILINE)
         choices = ", ".join(options)
         return f"{missing[1]}: unknown {missing[2]!r}; expected one of {choices}"
-    return _first_line(error).replace("++", "")
+    return first_line(error).replace("++", "")
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
+    """What is wrong, in one line; in YAML with its place."""
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        file = "" if mark.name.startswith("<") else f"{mark.name}, "  # else given as a string
+        return f"{file}line {mark.line + 1}, column {mark.column + 1}: {error.problem}"
     return next((line.strip() for line in str(error).splitlines() if line.strip()), repr(error))
 
 

@@ -18,6 +18,7 @@ from prt_torch.transfer import Surface, TransferTensor
 
 _BLOCK_BYTES = 2**27
 _ERROR_BYTES = 2**25
+_TIMED_POINTS = 2000  # of a tensor that does not fit
 
 
 @torch.no_grad()
@@ -117,6 +118,21 @@ def median_seconds(
             if round_ >= warm_up:
                 taken.append(time.perf_counter() - start)
     return [statistics.median(taken) for taken in times]
+
+
+def timed_block(transfer: TransferTensor, memory_budget: int) -> tuple[TransferTensor, float]:
+    """What stands for an uncompressed tensor where it is timed, and what its times count for.
+
+    Args:
+        transfer: The tensor.
+        memory_budget: Bytes; where the tensor takes more than half of them, 2,000 points are timed.
+
+    Returns:
+        The block, and points of the tensor over its points.
+    """
+    fits = transfer.num_bytes <= memory_budget // 2
+    points = transfer.num_points if fits else min(_TIMED_POINTS, transfer.num_points)
+    return transfer.block(slice(0, points)), transfer.num_points / points
 
 
 def peak_bytes(function: Callable[[], Any]) -> int:

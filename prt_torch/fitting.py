@@ -43,8 +43,9 @@ class FitResult:
         representation: The one that was given, at its best state.
         status: ``converged`` (steps gain less than the tolerance), ``max_steps``, ``stagnated``
             (several steps in a row found nothing better), ``nonfinite`` (the loss became NaN or
-            infinite and the best state before was kept), ``interrupted``, or, where no steps were
-            asked for, ``closed_form`` or ``rank_deficient`` (:func:`construction_status`).
+            infinite and the best state before was kept, the given one if it was so from the start),
+            ``interrupted``, or, where no steps were asked for, ``closed_form`` or
+            ``rank_deficient`` (:func:`construction_status`).
         error_before: Squared error over squared norm in the metric, as given.
         error_after: The same at the end; never larger.
         steps: Steps taken, those before a resumption included.
@@ -180,8 +181,11 @@ class _Run:
     def begin(self) -> None:
         """Measure what was given."""
         with torch.no_grad():
-            self._keep_if_best(float(self._loss(backward=False)))
-        self.history = [self.best_error]
+            error = float(self._loss(backward=False))
+        self._keep(error)
+        self.history = [error]
+        if not math.isfinite(error):
+            self.ended = "nonfinite"
 
     def step(self, tolerance: float) -> None:
         """One optimiser step; sets ``ended`` if it was the last."""
@@ -195,7 +199,8 @@ class _Run:
         if not math.isfinite(error):
             self.ended = "nonfinite"
             return
-        self._keep_if_best(error)
+        if error < self.best_error:
+            self._keep(error)
         recent = self.history[-_PATIENCE:]
         if 0 <= before - error <= tolerance * before:
             self.ended = "converged"
@@ -208,10 +213,9 @@ class _Run:
                 parameter.copy_(self.best[name])
                 parameter.grad = None
 
-    def _keep_if_best(self, error: float) -> None:
-        if error < self.best_error:
-            self.best_error = error
-            self.best = {name: p.detach().clone() for name, p in self.parameters.items()}
+    def _keep(self, error: float) -> None:
+        self.best_error = error
+        self.best = {name: p.detach().clone() for name, p in self.parameters.items()}
 
     def _closure(self) -> float:
         self.optimizer.zero_grad()
@@ -231,9 +235,13 @@ class _Run:
         return total
 
     def _kind(self) -> list[Any]:
-        """What a checkpoint must have been made with: the optimiser, and parameters by shape."""
+        """What a checkpoint must have been made with: optimiser, shapes, and the same places.
+
+        Numbers of other clusters would be given to the wrong points.
+        """
         shapes = [[name, list(p.shape)] for name, p in sorted(self.parameters.items())]
-        return [type(self.optimizer).__name__, shapes]
+        places = [self.representation.get_buffer(name) for name in self.representation.places]
+        return [type(self.optimizer).__name__, shapes, store.digest(*places)]
 
     def write(self, path: Path) -> None:
         """Everything that the next step depends on."""

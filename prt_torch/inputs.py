@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from prt_torch import store
 from prt_torch.assets import (
     Environment,
     Mesh,
@@ -13,12 +14,13 @@ from prt_torch.assets import (
     procedural_scene,
 )
 from prt_torch.assets.brdf import brdf
-from prt_torch.assets.material import Material, split_borders
+from prt_torch.assets.material import Material, assign_materials, split_borders
 from prt_torch.assets.medium import PRESETS
 from prt_torch.baking import check_memory
 from prt_torch.bases import SRBF, CubeDirections, Haar, LightBasis, SphericalHarmonics
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
+from prt_torch.metric import MAX_PRIOR_COEFFS
 from prt_torch.settings import LightConfig, PartConfig, RunConfig, SceneConfig
 
 
@@ -42,6 +44,15 @@ class Inputs:
             f"{', '.join(names[:3])}{f' and {len(names) - 3} more' if names[3:] else ''}: {words}"
             for words, names in parts.items()
         )
+
+    def digest(self) -> str:
+        """SHA-256 of what the files held: surface, materials of points, and light."""
+        mesh, lights = self.mesh, [*self.fit_lights, *self.test_lights]
+        surface = (mesh.vertices, mesh.faces, mesh.normals, mesh.albedo)
+        found, of_points = assign_materials(mesh, self.materials)
+        glossy = [made_of.glossy and made_of.glossy.describe() for made_of in found]
+        light = (part for one in lights for part in (one.image, one.rotation))
+        return store.digest(*surface, glossy, of_points, *light)
 
 
 def _words(material: Material) -> str:
@@ -68,6 +79,11 @@ def load_inputs(config: RunConfig) -> Inputs:
     )
     if config.fit.metric == "light_prior" and not inputs.fit_lights:
         raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
+    if config.fit.metric == "light_prior" and basis.num_coeffs > MAX_PRIOR_COEFFS:
+        raise InputError(
+            f"fit.metric: light_prior takes at most {MAX_PRIOR_COEFFS} light coefficients, "
+            f"{basis.name} has {basis.num_coeffs}"
+        )
     names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")

@@ -20,6 +20,7 @@ from prt_torch import store
 from prt_torch.account import PICTURES, write_report
 from prt_torch.assets import Mesh
 from prt_torch.baking import RESOLVED, bake
+from prt_torch.bases import SphericalHarmonics
 from prt_torch.construction import Problem, closed_form
 from prt_torch.errors import InputError
 from prt_torch.fitting import construction_status, fit
@@ -39,6 +40,7 @@ from prt_torch.settings import (
     CPCAConfig,
     RepresentationConfig,
     RunConfig,
+    ZonalLobesConfig,
 )
 from prt_torch.solves import Fitted, solves
 from prt_torch.transfer import TransferTensor
@@ -131,16 +133,17 @@ def _load(config: RunConfig) -> Inputs:
     results = [wanted.label for wanted in config.fitted]
     if len(set(results)) != len(results):
         raise InputError(f"representations: expected different ones, got {', '.join(results)}")
-    return load_inputs(config)
+    inputs = load_inputs(config)
+    harmonic = isinstance(inputs.light_basis, SphericalHarmonics)
+    if not harmonic and any(isinstance(wanted, ZonalLobesConfig) for wanted in config.fitted):
+        given = config.transfer.light_basis
+        raise InputError(f"representation: zonal_lobes need transfer.light_basis=sh, got {given}")
+    return inputs
 
 
 def _claim(config: RunConfig, inputs: Inputs) -> str:
     """What the results of a run follow from: its configuration, and what the files held."""
-    mesh, lights = inputs.mesh, [*inputs.fit_lights, *inputs.test_lights]
-    surface = (mesh.vertices, mesh.faces, mesh.normals, mesh.albedo)
-    light = (part for one in lights for part in (one.image, one.rotation))
-    hashed = store.digest(*surface, *light)
-    return f"# inputs {hashed}\n{OmegaConf.to_yaml(OmegaConf.create(_identity(config)))}"
+    return f"# inputs {inputs.digest()}\n{OmegaConf.to_yaml(OmegaConf.create(_identity(config)))}"
 
 
 def _check_folder(out: Path, config: RunConfig, inputs: Inputs) -> None:
@@ -307,7 +310,12 @@ def _fit_one(
         model = load(path, geometry=transfer.surface)
         return Fitted(name, model, **store.read_json(record))
     start = time.perf_counter()
-    representation = _closed_form(wanted, config, inputs, transfer, metric)
+    try:
+        representation = _closed_form(wanted, config, inputs, transfer, metric)
+    except InputError:
+        raise
+    except ValueError as error:  # parameters that do not suit this transfer
+        raise InputError(f"{name}: {error}") from error
     construction = construction_status(representation)
     result = fit(
         representation,

@@ -61,6 +61,11 @@ class MaterialConfig(PartConfig):
         default_factory=dict, description="other materials, by name of a part of the mesh"
     )
 
+    @property
+    def is_glossy(self) -> bool:
+        """Whether any part is."""
+        return any(made_of.glossy for made_of in (self, *self.parts.values()))
+
 
 class TransferConfig(_Section):
     """What is baked."""

@@ -10,7 +10,7 @@ import trimesh
 from prt_torch import InputError, TransferTensor, bake, evaluate
 from prt_torch.assets import concatenate, ground_plane, mesh_from_arrays
 from prt_torch.bases import CubeDirections, SphericalHarmonics
-from prt_torch.budget import Limits, choose, coarse, coarse_grids, refine
+from prt_torch.budget import Limits, Tried, choose, coarse, coarse_grids, refine
 from prt_torch.construction import Problem, closed_form
 
 GRIDS = {
@@ -104,6 +104,39 @@ def test_reasons_name_the_choice_and_the_others():
     assert f"of {len(choice.all_tried)} tried" in choice.why[0]
     others = {one.kind for one in choice.all_tried} - {choice.tried.kind}
     assert all(any(reason.startswith(kind) for reason in choice.why[1:]) for kind in others)
+
+
+def with_share(rank: int, share: float | None, size: int, error: float) -> Tried:
+    parameters = {"num_clusters": 4, "rank": rank, "quantisation_share": share}
+    return Tried("cpca", parameters, size, error, 0.0)
+
+
+@pytest.mark.parametrize("other", [0.05, None])
+def test_only_sizes_have_others_between(other):
+    """Between two shares, or a share and none, nothing is fitted; ranks of either are followed."""
+    known = [
+        with_share(1, 4.0, 600, 0.4),
+        with_share(4, 4.0, 9000, 0.1),
+        with_share(1, other, 8000, 0.3),
+    ]
+    choice = refine(scene("ball"), Limits(bytes=5000), known)
+    fresh = [one.parameters for one in choice.all_tried[len(known) :]]
+    assert {one["rank"] for one in fresh} == {2, 3}
+    assert {one["quantisation_share"] for one in fresh} == {4.0}
+
+
+def test_entries_of_one_kind_may_have_different_parameters():
+    """As configs/sweep/comparison.yaml has them: in codes and as they are."""
+    plain = [
+        Tried("cpca", {"num_clusters": 4, "rank": rank}, size, error, 0.0)
+        for rank, size, error in ((1, 3000, 0.4), (4, 9000, 0.2))
+    ]
+    coded = [with_share(1, 4.0, 600, 0.3), with_share(4, 4.0, 9000, 0.1)]
+    choice = refine(scene("ball"), Limits(bytes=5000), [*plain, *coded])
+    assert choice.tried.bytes <= 5000
+    fresh = [one.parameters for one in choice.all_tried[4:]]
+    assert fresh
+    assert all(one["rank"] in (2, 3) for one in fresh)
 
 
 @pytest.mark.slow

@@ -209,6 +209,21 @@ BAD_LIGHTS: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
 }
 
 BAD_CONFIGURATIONS = {
+    "lobes without harmonics": (
+        ["representations=[zonal_lobes]", "transfer.light_basis=cube"],
+        "representation",
+        "zonal_lobes need transfer.light_basis=sh, got cube",
+    ),
+    "prior of too many": (
+        [
+            "fit.metric=light_prior",
+            "transfer.light_basis=cube",
+            "transfer.resolution=32",
+            "transfer.light_resolution=32",
+        ],
+        "fit.metric",
+        "at most 2048 light coefficients, cube 6x32x32 has 6144",
+    ),
     "unknown key": (["sceen.mesh=m.obj"], "sceen.mesh", "expected one of scene, material, light"),
     "unknown nested key": (["scene.mash=m.obj"], "scene.mash", "expected one of mesh, ground"),
     "unknown representation": (["representation=spca"], "representation", "expected one of"),
@@ -553,6 +568,14 @@ class TestBadInput:
         for script in (FIT, BAKE):
             refuse(capfd, script, arguments(*given), key, expected)
 
+    def test_what_only_the_bake_can_tell(self, capfd):
+        """Codes of three channels, of transfer that has one."""
+        write("ball.obj", obj())
+        wanted = "representations=[{name: wavelet, codes: 11/11/10}]"
+        assert MAINS[FIT](arguments(wanted, "scene.ground=false")) == 2
+        *_, last = capfd.readouterr().err.splitlines()
+        assert last.startswith("error: wavelet 96 11/11/10: expected three channels")
+
     def test_processes(self):
         write("ball.obj", obj())
         write("far.glb", gltf(faces=FAR, binary=True))
@@ -665,6 +688,7 @@ class TestReport:
 
     def test_unknown_option(self, capfd):
         refuse(capfd, REPORT, ["run", "--output=all"], "--output=all", "usage: ")
+        refuse(capfd, REPORT, ["run", "--out=./run"], "--out=run", "own report would be lost")
 
     def test_two_runs(self, capfd, finished):
         write("ball.obj", obj())

@@ -1,6 +1,7 @@
 """Configurations: what ships is valid, and what is wrong is one line that says what is right."""
 
 import inspect
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from prt_torch.config import load_config, parse_command_line
 from prt_torch.errors import InputError
 from prt_torch.representations import CPCA
 from prt_torch.settings import RunConfig
+from prt_torch.sweep import parse_sweep
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 COMPLETE = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
@@ -281,3 +283,22 @@ class TestRefusals:
 
     def test_several_mistakes_are_counted(self):
         assert refusal("seed=-1", "transfer.order=0", "fit.max_steps=-1").endswith("(and 2 more)")
+
+    @pytest.mark.parametrize("file", ["mine", "representation/mine", "sweep/mine"])
+    def test_yaml_that_cannot_be_read_is_one_line_with_its_place(self, tmp_path, file):
+        configs = tmp_path / "configs"
+        shutil.copytree(CONFIGS, configs)
+        (configs / f"{file}.yaml").write_text("name: cpca\nname: cpca\n")
+        calls = {
+            "mine": [lambda: load_config(configs, "mine", [])],
+            "representation/mine": [
+                lambda: load_config(configs, "fit", ["representation=mine"]),
+                lambda: load_config(configs, "fit", ["representations=[mine]"]),
+            ],
+            "sweep/mine": [lambda: parse_sweep(["sweep=mine"], configs, script="train/sweep.py")],
+        }
+        for call in calls[file]:
+            with pytest.raises(InputError) as caught:
+                call()
+            place = f"{configs / file}.yaml, line 2, column 1: found duplicate key name"
+            assert str(caught.value).endswith(place)

@@ -111,6 +111,17 @@ def test_without_anything_to_say_there_are_no_vectors(affine: bool):
         assert model(torch.ones(1, 9, 3)).isfinite().all()
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_means_that_are_exact_stay_as_fine_as_their_codes(scale: float):
+    """As many clusters as different points: no weight says anything, and means say all."""
+    few = scale * torch.randn(5, 9, generator=torch.Generator().manual_seed(1))
+    transfer = TransferTensor.from_dense(few.repeat(12, 1))
+    model = CPCA.from_transfer(transfer, num_clusters=5, rank=2)
+    assert float(model.weights.detach().abs().max()) == 0.0
+    coded = model.coded(transfer, share=1.0)
+    assert torch.allclose(coded.dense(), transfer.dense(), rtol=0, atol=2e-4 * scale)
+
+
 def test_training_sees_what_a_file_holds():
     transfer = in_harmonics()
     model = CPCA.from_transfer(transfer, num_clusters=6, rank=3, quantisation_share=4.0)

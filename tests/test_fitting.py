@@ -86,6 +86,18 @@ def test_exploding_steps_end_nonfinite_and_keep_the_best():
     assert all(torch.isfinite(p).all() for p in model.parameters())
 
 
+@pytest.mark.parametrize("steps", [0, 3])
+def test_nonfinite_from_the_start_stays_as_given(steps):
+    """Squares of float32 beyond 1e19 overflow."""
+    transfer = TransferTensor.from_dense(torch.full((5, 4), 1e25))
+    model = DenseTransfer.from_transfer(transfer)
+    with torch.no_grad():
+        model.values.neg_()
+    result = fit(model, transfer, max_steps=steps)
+    assert (result.status, result.steps, result.error_after) == ("nonfinite", 0, math.inf)
+    assert torch.equal(model.dense(), -transfer.dense())
+
+
 @pytest.mark.parametrize("optimizer", ["lbfgs", "adam"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_resumption_is_bit_identical(tmp_path, optimizer, dtype):
@@ -110,6 +122,23 @@ def test_a_finished_fit_is_not_continued(tmp_path):
     assert first.status == "converged"
     again = fit(disturbed(transfer), transfer, max_steps=300, checkpoint=path)
     assert (again.steps, again.error_after) == (first.steps, first.error_after)
+
+
+def test_a_checkpoint_of_other_clusters_is_refused(tmp_path):
+    transfer = random_transfer(points=100)
+    path = tmp_path / "fit.checkpoint"
+    own, other = (
+        CPCA.from_transfer(
+            transfer, num_clusters=5, rank=2, generator=torch.Generator().manual_seed(seed)
+        )
+        for seed in (0, 1)
+    )
+    assert not torch.equal(own.labels, other.labels)
+    fit(own, transfer, max_steps=1, checkpoint=path)
+    before = measured(other, transfer)
+    with pytest.raises(InputError, match=r"fit\.checkpoint: is the checkpoint of another fit"):
+        fit(other, transfer, max_steps=2, checkpoint=path)
+    assert measured(other, transfer) == before
 
 
 def test_damaged_checkpoint(tmp_path):

@@ -194,6 +194,16 @@ def test_peak_bytes_counts_what_is_held_at_once():
     assert evaluate.peak_bytes(two_at_once) == 2_000_004  # and the sum
 
 
+@pytest.mark.parametrize(("points", "timed"), [(50, 50), (2500, 2000)])
+def test_a_tensor_that_does_not_fit_is_timed_by_some_of_its_points(points, timed):
+    transfer = random_transfer(points=points)
+    whole, once = evaluate.timed_block(transfer, 2 * transfer.num_bytes)
+    assert (whole.num_points, once) == (points, 1.0)
+    some, factor = evaluate.timed_block(transfer, 2 * transfer.num_bytes - 2)
+    assert (some.num_points, factor) == (timed, points / timed)
+    assert torch.equal(some.dense(), transfer.dense()[:timed])
+
+
 def test_median_seconds_takes_functions_in_turn():
     order = []
     functions = [lambda: order.append("a"), lambda: order.append("b")]

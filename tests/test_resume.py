@@ -125,11 +125,12 @@ def kill_and_resume(
 ) -> None:
     """Kill at random moments of work that takes some seconds, then let it end.
 
-    The moments are uniform over most of the work. Each process lives for the time from one to the
-    next, so all of them together have done no more than is done at the last moment.
+    One moment is in each equal part of most of the work. Each process lives for the time from one
+    to the next, so all of them together have done no more than is done at the last moment.
     """
     generator = random.Random(seed)
-    at = sorted(generator.uniform(0.02, 0.85) * seconds for _ in range(moments))
+    parts = [(part + generator.random()) / moments for part in range(moments)]
+    at = [(0.02 + 0.83 * part) * seconds for part in parts]
     endings = []
     for before, after in zip([0.0, *at], at, strict=False):
         process = start(folder, announced, script, given)
@@ -243,7 +244,7 @@ class TestKilledProcesses:
             whole.given,
             seconds=whole.fit_seconds,
             moments=moments,
-            seed=2,
+            seed=3,
         )
         check_same(folder / "cache", whole.folder / "cache")
         check_same(folder / "out", whole.folder / "out")

@@ -92,11 +92,6 @@ class TensorStatistics:
     moved: list[int]
     seconds: dict[str, float]
 
-    @property
-    def energy_kept(self) -> float:
-        """Share of the squared norm."""
-        return 1.0 - self.squared_error / self.squared_norm if self.squared_norm else 1.0
-
     @classmethod
     def together(
         cls, groups: Sequence["TensorStatistics"], seconds: dict[str, float], power: float

@@ -42,6 +42,7 @@ from prt_torch.transfer import Surface
 
 _LEVELS = 4  # of an octave: finer ones would gain nothing
 _VECTOR_BITS, _WEIGHT_BITS = 15, 16  # at most: float32 tells such codes apart in any metric
+_TINY = torch.finfo(torch.float64).tiny
 _WORTH = 2.0  # times the squared noise of a component's codes: what these cost, noise included
 
 
@@ -125,16 +126,17 @@ def coded(
         processes: Those that have points too.
     """
     owners = entry_vectors(encoding.labels, encoding.ranks, encoding.affine)
-    numbers = encoding.representatives.numel() + len(encoding.weights)
     squares = torch.zeros(len(encoding.representatives) + 1, dtype=torch.float64).to(owners.device)
     squares.index_add_(0, owners, encoding.weights.double().square())
     squares[-1] = len(encoding.weights)
     squares = processes.sum(squares)
     numbers = encoding.representatives.numel() + float(squares[-1])
-    step = (12.0 * share * squared_error / max(numbers, 1.0)) ** 0.5
+    wanted = (12.0 * share * squared_error / max(numbers, 1.0)) ** 0.5
     largest = torch.zeros(1, dtype=torch.float64, device=owners.device)
     largest[0] = encoding.weights.abs().max() if len(encoding.weights) else 0.0
-    step = full_scale(processes.largest(largest), _WEIGHT_BITS).clamp_min(step)
+    largest = processes.largest(largest)
+    # Weights that are all zero need no step, and must not make those of the means coarse.
+    step = torch.where(largest > 0, full_scale(largest, _WEIGHT_BITS), _TINY).clamp_min(wanted)[0]
     sizes = cluster_sizes(encoding.labels, len(encoding.ranks), processes)
     runs = encoding.ranks + int(encoding.affine)
     counts = sizes.repeat_interleave(runs).double()

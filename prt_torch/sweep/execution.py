@@ -184,12 +184,10 @@ def _identity(config: RunConfig) -> dict[str, Any]:
 
 def _claim(folder: Path, config: RunConfig, inputs: Inputs, transfer: TransferTensor) -> None:
     """Make sure that a folder holds nothing, or points of this bake under these lights."""
-    lights = [*inputs.fit_lights, *inputs.test_lights]
-    light = (part for one in lights for part in (one.image, one.rotation))
     claim = {
         "configuration": _identity(config),
         "inputs": transfer.provenance["inputs"],
-        "lights": store.digest(*light),
+        "files": inputs.digest(),
     }
     path = folder / CLAIM
     if path.exists() and store.digest(store.read_json(path)) != store.digest(claim):

@@ -21,7 +21,6 @@ from prt_torch.transfer import TransferTensor
 
 VIEWS = 6
 """Around the scene."""
-_DENSE_BLOCK_POINTS = 2000  # timed and scaled up where the whole tensor would not fit
 _ROUNDS, _WARM_UP = 9, 2
 
 
@@ -109,9 +108,7 @@ class Judge:
     @torch.no_grad()
     def dense_seconds(self, memory_budget: int) -> dict[str, float]:
         """The same of the tensor itself, from some of its points where it takes too much memory."""
-        whole = self.transfer.num_bytes <= memory_budget // 2
-        points = self.transfer.num_points if whole else _DENSE_BLOCK_POINTS
-        block = self.transfer.block(slice(0, points))
+        block, factor = evaluate.timed_block(self.transfer, memory_budget)
         own = Judge(block, dict(list(self.lights.items())[:1]), self.views)
         taken = own.seconds(DenseTransfer.from_transfer(block))
-        return {name: value * self.transfer.num_points / points for name, value in taken.items()}
+        return {name: value * factor for name, value in taken.items()}

@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from yaml import YAMLError
 
-from prt_torch.config import load_config
+from prt_torch.config import first_line, load_config
 from prt_torch.errors import InputError
 from prt_torch.settings import KINDS, RunConfig
 
@@ -128,6 +129,11 @@ def parse_sweep(arguments: list[str], config_dir: Path, *, script: str) -> Sweep
     except ValidationError as error:
         raise InputError(_first_problem(error)) from error
     found.sweep.grids()
+    if found.sweep.waterfall and base.transfer.max_bounces and base.material.is_glossy:
+        raise InputError(
+            "sweep.waterfall: its truth is light by texels, in which glossy materials bounce no "
+            "light; set it to false, or transfer.max_bounces=0"
+        )
     return found
 
 
@@ -147,15 +153,21 @@ def _sections(config_dir: Path, group: str, overrides: list[str]) -> dict[str, A
     if not file.is_file():
         choices = ", ".join(sorted(path.stem for path in file.parent.glob("*.yaml")))
         raise InputError(f"sweep: unknown {group!r}; expected one of {choices}")
-    bare = next((one for one in overrides if "=" not in one), None)
-    if bare is not None:
-        raise InputError(f"{bare}: not KEY=VALUE")
+    given = [_override(one) for one in overrides]
     try:
-        given = OmegaConf.from_dotlist(overrides)
-        whole = OmegaConf.merge({"sweep": OmegaConf.load(file)}, given)
+        whole = OmegaConf.merge({"sweep": OmegaConf.load(file)}, *given)
         return dict(OmegaConf.to_container(whole, resolve=True))  # type: ignore[arg-type]
-    except (OmegaConfBaseException, ValueError, AttributeError) as error:
-        raise InputError(f"sweep: {str(error).splitlines()[0]}") from error
+    except (OmegaConfBaseException, YAMLError, ValueError, AttributeError) as error:
+        raise InputError(f"sweep: {first_line(error)}") from error
+
+
+def _override(text: str) -> DictConfig:
+    if "=" not in text:
+        raise InputError(f"{text}: not KEY=VALUE")
+    try:
+        return OmegaConf.from_dotlist([text])
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise InputError(f"{text}: {first_line(error)}") from error
 
 
 def _grid(at: int, entry: Mapping[str, Any]) -> tuple[str, dict[str, list[Any]]]:
