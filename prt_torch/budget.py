@@ -32,6 +32,8 @@ from prt_torch.transfer import TransferTensor
 Grids = Mapping[str, Mapping[str, Sequence[Any]]]
 """Values of each parameter, by kind."""
 
+_SHARE = "quantisation_share"
+_NEAR_SHARE = 1.15  # shares within this factor hardly differ in bytes
 _HOPEFUL = 3.0  # families whose best is within this factor of the best of all are refined
 _ROUNDS = 4
 _NEIGHBOURS = 2  # values of a parameter on each side of the best whose lines are followed
@@ -272,13 +274,13 @@ def _between(tried: Sequence[Tried], best: Tried, limits: Limits) -> list[Parame
         for line in lines.values():
             line.sort(key=lambda one: _size(one.parameters[name]))
             for low, high in itertools.pairwise(line):
-                middle = _middle(low.parameters[name], high.parameters[name])
+                middle = _middle(name, low.parameters[name], high.parameters[name])
                 if low.keeps(limits) != high.keeps(limits) and middle is not None:
                     proposed.append({**low.parameters, name: middle})
     # Between ranks that were tried, lines of their own begin.
     for name in tuned if len(tuned) > 1 else []:
         for value in _values_near(best, name, tried, 1):
-            middle = _middle(*sorted((value, best.parameters[name]), key=_size))
+            middle = _middle(name, *sorted((value, best.parameters[name]), key=_size))
             if middle is not None:
                 proposed.append({**best.parameters, name: middle})
     return proposed
@@ -298,11 +300,13 @@ def _near(one: Tried, best: Tried, name: str, tried: Sequence[Tried]) -> bool:
 
 def _choices(one: Tried) -> Parameters:
     """Its parameters; of a size, only that there is one."""
-    return {k: "a size" if _is_size(value) else value for k, value in one.parameters.items()}
+    return {k: "a size" if _is_size(k, value) else value for k, value in one.parameters.items()}
 
 
-def _is_size(value: Any) -> bool:
-    """Whether a parameter is a whole number, or a list of them: there are others between two."""
+def _is_size(name: str, value: Any) -> bool:
+    """Whether there are others between two: whole numbers, lists of them, and shares."""
+    if name == _SHARE:
+        return value is not None
     parts = value if isinstance(value, list | tuple) else [value]
     return all(type(part) is int for part in parts)
 
@@ -311,8 +315,11 @@ def _size(value: Any) -> float:
     return math.prod(value) if isinstance(value, list | tuple) else float(value)
 
 
-def _middle(low: Any, high: Any) -> Any:
+def _middle(name: str, low: Any, high: Any) -> Any:
     """Between two values, None where there is nothing between."""
+    if name == _SHARE:
+        middle = float(f"{math.sqrt(low * high):.3g}")
+        return middle if high > _NEAR_SHARE * low > 0.0 else None
     if isinstance(low, list | tuple):
         middle = [round((a + b) / 2) for a, b in zip(low, high, strict=True)]
         return None if middle in (list(low), list(high)) else middle
