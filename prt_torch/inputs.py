@@ -66,8 +66,10 @@ def load_inputs(config: RunConfig) -> Inputs:
         _lights(light.test, light),
         basis,
     )
-    if config.fit.metric == "light_prior" and not inputs.fit_lights:
-        raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
+    if config.fit.metric == "light_prior" and not any(one.image.any() for one in inputs.fit_lights):
+        raise InputError(
+            "light.fit: expected at least one light that is not black for fit.metric=light_prior"
+        )
     names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
