@@ -19,6 +19,7 @@ from prt_torch.baking import check_memory
 from prt_torch.bases import SRBF, CubeDirections, Haar, LightBasis, SphericalHarmonics
 from prt_torch.errors import InputError
 from prt_torch.gallery import file_name
+from prt_torch.metric import MAX_PRIOR_COEFFS
 from prt_torch.settings import LightConfig, PartConfig, RunConfig, SceneConfig
 
 
@@ -66,9 +67,12 @@ def load_inputs(config: RunConfig) -> Inputs:
         _lights(light.test, light),
         basis,
     )
-    if config.fit.metric == "light_prior" and not any(one.image.any() for one in inputs.fit_lights):
+    if config.fit.metric == "light_prior":
+        _check_prior(inputs)
+    lobes = any(wanted.name == "zonal_lobes" for wanted in config.fitted)
+    if lobes and not isinstance(basis, SphericalHarmonics):
         raise InputError(
-            "light.fit: expected at least one light that is not black for fit.metric=light_prior"
+            f"representation: zonal_lobes need transfer.light_basis=sh, not {basis.name}"
         )
     names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
@@ -81,6 +85,19 @@ def load_inputs(config: RunConfig) -> Inputs:
     fine = config.transfer.resolution * config.transfer.supersampling
     check_memory(basis, fine, config.memory_budget)
     return inputs
+
+
+def _check_prior(inputs: Inputs) -> None:
+    """Make sure that there is light to expect, in a basis that is small enough."""
+    if not any(light.image.any() for light in inputs.fit_lights):
+        raise InputError(
+            "light.fit: expected at least one light that is not black for fit.metric=light_prior"
+        )
+    if inputs.light_basis.num_coeffs > MAX_PRIOR_COEFFS:
+        raise InputError(
+            f"fit.metric: light_prior takes at most {MAX_PRIOR_COEFFS} light coefficients, "
+            f"got the {inputs.light_basis.num_coeffs} of {inputs.light_basis.name}"
+        )
 
 
 def _mesh(scene: SceneConfig) -> Mesh:

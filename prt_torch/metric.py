@@ -19,7 +19,8 @@ from prt_torch.bases import Diffuse, ExitBasis, LightBasis, SphericalHarmonics
 from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
-_MAX_PRIOR_COEFFS = 2048  # its matrix has the square of it
+MAX_PRIOR_COEFFS = 2048
+"""Most light coefficients of a light prior, whose matrix has the square of them."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,9 @@ class Metric:
                 coefficients.
         """
         coeffs = light_basis.num_coeffs
-        if coeffs > _MAX_PRIOR_COEFFS:
+        if coeffs > MAX_PRIOR_COEFFS:
             raise ValueError(
-                f"a light prior takes at most {_MAX_PRIOR_COEFFS} light coefficients, got {coeffs}"
+                f"a light prior takes at most {MAX_PRIOR_COEFFS} light coefficients, got {coeffs}"
             )
         if len(lights) == 0:
             raise ValueError("a light prior needs at least one light")

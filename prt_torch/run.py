@@ -257,11 +257,18 @@ def _closed_form(
     transfer: TransferTensor,
     metric: Metric,
 ) -> Representation:
-    """A representation as its paper constructs it."""
-    if isinstance(wanted, CPCAConfig):
-        return _clustered(wanted, config, inputs, transfer, metric)
-    problem = Problem(transfer, metric, config.seed, config.memory_budget)
-    return closed_form(problem, wanted.name, wanted.model_dump(exclude={"name"}))
+    """A representation as its paper constructs it.
+
+    Raises:
+        InputError: If the transfer does not suit it.
+    """
+    try:
+        if isinstance(wanted, CPCAConfig):
+            return _clustered(wanted, config, inputs, transfer, metric)
+        problem = Problem(transfer, metric, config.seed, config.memory_budget)
+        return closed_form(problem, wanted.name, wanted.model_dump(exclude={"name"}))
+    except ValueError as error:  # the parameters are valid, but what was baked decides the rest
+        raise InputError(f"representation {wanted.label}: {error}") from error
 
 
 def _clustered(

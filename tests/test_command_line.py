@@ -235,6 +235,16 @@ BAD_CONFIGURATIONS = {
         "light.fit",
         "not black",
     ),
+    "too much light to expect": (
+        ["fit.metric=light_prior", "transfer=haar", "transfer.resolution=32"],
+        "fit.metric",
+        "at most 2048 light coefficients, got the 6144",
+    ),
+    "lobes in wavelets": (
+        ["representations=[cpca,zonal_lobes]", "transfer=haar"],
+        "zonal_lobes",
+        "light_basis=sh, not Haar",
+    ),
     "unknown light": (["light.test=[moon]"], "moon", "neither a file nor one of"),
     "unknown option": (["--fast"], "--fast", "unknown option"),
     "unknown configuration": (["--config-name=fast"], "--config-name=fast", "expected one of"),
@@ -574,6 +584,13 @@ class TestBadInput:
             check_line(done.stderr, name)
             assert done.stdout == ""
         assert tree() == before
+
+    def test_codes_that_do_not_suit_what_was_baked(self, capfd):
+        write("ball.obj", obj())
+        given = arguments("representations=[{name: wavelet, codes: 11/11/10}]")
+        assert MAINS[FIT](given) == 2
+        line = capfd.readouterr().err
+        check_line(line, "representation wavelet 96 11/11/10", "three channels")
 
 
 class TestOutputFolder:
