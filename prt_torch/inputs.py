@@ -77,13 +77,8 @@ def load_inputs(config: RunConfig) -> Inputs:
         _lights(light.test, light),
         basis,
     )
-    if config.fit.metric == "light_prior" and not inputs.fit_lights:
-        raise InputError("light.fit: expected at least one light for fit.metric=light_prior")
-    if config.fit.metric == "light_prior" and basis.num_coeffs > MAX_PRIOR_COEFFS:
-        raise InputError(
-            f"fit.metric: light_prior takes at most {MAX_PRIOR_COEFFS} light coefficients, "
-            f"{basis.name} has {basis.num_coeffs}"
-        )
+    if config.fit.metric == "light_prior":
+        _check_prior(inputs)
     names = [file_name(environment.name) for environment in inputs.test_lights]
     if len(set(names)) != len(names):
         raise InputError(f"light.test: expected different lights, got {', '.join(names)}")
@@ -95,6 +90,19 @@ def load_inputs(config: RunConfig) -> Inputs:
     fine = config.transfer.resolution * config.transfer.supersampling
     check_memory(basis, fine, config.memory_budget)
     return inputs
+
+
+def _check_prior(inputs: Inputs) -> None:
+    """Make sure that there is light to expect, in a basis that is small enough."""
+    if not any(light.image.any() for light in inputs.fit_lights):
+        raise InputError(
+            "light.fit: expected at least one light that is not black for fit.metric=light_prior"
+        )
+    if inputs.light_basis.num_coeffs > MAX_PRIOR_COEFFS:
+        raise InputError(
+            f"fit.metric: light_prior takes at most {MAX_PRIOR_COEFFS} light coefficients, "
+            f"{inputs.light_basis.name} has {inputs.light_basis.num_coeffs}"
+        )
 
 
 def _mesh(scene: SceneConfig) -> Mesh:

@@ -75,7 +75,8 @@ class Metric:
                 lights unlike these still count. It bounds the condition of the metric.
 
         Raises:
-            ValueError: If there is no light, or the basis has too many coefficients.
+            ValueError: If there is no light or all are black, or the basis has too many
+                coefficients.
         """
         coeffs = light_basis.num_coeffs
         if coeffs > MAX_PRIOR_COEFFS:
@@ -92,7 +93,9 @@ class Metric:
             power = turned.square().sum((1, 2), keepdim=True)
             unit = (turned / torch.where(power > 0, power, 1.0).sqrt()).movedim(1, 0).flatten(1)
             moment += unit @ unit.mT
-        moment = moment * (coeffs / moment.trace().clamp_min(torch.finfo(torch.float64).tiny))
+        if not moment.trace() > 0:
+            raise ValueError("expected a light that is not black, got nothing but zeros")
+        moment = moment * (coeffs / moment.trace())
         moment = torch.lerp(moment, _uncorrelated(moment, light_basis), shrinkage)
         moment = moment + floor * torch.eye(coeffs, dtype=torch.float64)
         rows = (exit_basis or Diffuse()).gram_root()

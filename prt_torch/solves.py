@@ -130,5 +130,6 @@ def _ended(regularised: bool) -> str:
 
 def _condition(gram: Float[Tensor, "n n"]) -> float:
     """Largest over smallest eigenvalue; infinite where rounding leaves none above zero."""
-    smallest, *_, largest = torch.linalg.eigvalsh(gram).tolist()
+    ascending = torch.linalg.eigvalsh(gram).tolist()
+    smallest, largest = ascending[0], ascending[-1]
     return largest / smallest if smallest > 0.0 else math.inf

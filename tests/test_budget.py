@@ -111,18 +111,29 @@ def with_share(rank: int, share: float | None, size: int, error: float) -> Tried
     return Tried("cpca", parameters, size, error, 0.0)
 
 
-@pytest.mark.parametrize("other", [0.05, None])
-def test_only_sizes_have_others_between(other):
-    """Between two shares, or a share and none, nothing is fitted; ranks of either are followed."""
+def test_only_sizes_have_others_between():
+    """Between a share and none nothing is fitted; ranks of either are followed."""
     known = [
         with_share(1, 4.0, 600, 0.4),
         with_share(4, 4.0, 9000, 0.1),
-        with_share(1, other, 8000, 0.3),
+        with_share(1, None, 8000, 0.3),
     ]
     choice = refine(scene("ball"), Limits(bytes=5000), known)
     fresh = [one.parameters for one in choice.all_tried[len(known) :]]
     assert {one["rank"] for one in fresh} == {2, 3}
     assert {one["quantisation_share"] for one in fresh} == {4.0}
+
+
+@pytest.mark.parametrize("fine", [0.05, 1])
+def test_shares_have_others_between(fine):
+    """Until they hardly differ."""
+    known = [with_share(2, 4, 600, 0.4), with_share(2, fine, 9000, 0.1)]
+    choice = refine(scene("ball"), Limits(bytes=5000), known)
+    shares = [one.parameters["quantisation_share"] for one in choice.all_tried]
+    assert shares[2] == pytest.approx((4 * fine) ** 0.5, rel=0.01)
+    assert len(shares) > 3
+    assert len(set(shares)) == len(shares)
+    assert all(fine < share < 4 for share in shares[2:])
 
 
 def test_entries_of_one_kind_may_have_different_parameters():

@@ -126,9 +126,9 @@ def gltf(points=POINTS, faces=FACES, *, binary: bool) -> bytes:
     return b"glTF" + struct.pack("<II", 2, len(chunks) + 12) + chunks
 
 
-def exr(name: str, value: float | None = None) -> bytes:
-    """A 16 x 8 image of ones, with one pixel of another value if given."""
-    pixels = np.ones((8, 16, 3), np.float32)
+def exr(name: str, value: float | None = None, *, rest: float = 1.0) -> bytes:
+    """A 16 x 8 image of one value, with one pixel of another if given."""
+    pixels = np.full((8, 16, 3), rest, np.float32)
     if value is not None:
         pixels[3, 5] = value
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -245,6 +245,11 @@ BAD_CONFIGURATIONS = {
         "expected different ones",
     ),
     "no light to expect": (["fit.metric=light_prior", "light.fit=[]"], "light.fit", "at least one"),
+    "black light to expect": (
+        ["fit.metric=light_prior", "light.fit=[black.exr]"],
+        "light.fit",
+        "not black",
+    ),
     "unknown light": (["light.test=[moon]"], "moon", "neither a file nor one of"),
     "unknown option": (["--fast"], "--fast", "unknown option"),
     "unknown configuration": (["--config-name=fast"], "--config-name=fast", "expected one of"),
@@ -565,6 +570,7 @@ class TestBadInput:
         given, key, expected = BAD_CONFIGURATIONS[case]
         write("ball.obj", obj())
         exr("sky.exr")
+        exr("black.exr", rest=0.0)
         for script in (FIT, BAKE):
             refuse(capfd, script, arguments(*given), key, expected)
 

@@ -216,6 +216,8 @@ def test_a_light_prior_that_is_shrunk_whole_knows_the_power_of_bands_only():
         assert torch.allclose(weighed @ weighed.mT, power * torch.eye(2 * band + 1).double())
     with pytest.raises(ValueError, match="expected a shrinkage"):
         Metric.light_prior(lights, basis, shrinkage=1.5)
+    with pytest.raises(ValueError, match="not black"):
+        Metric.light_prior(torch.zeros_like(lights), basis)
 
 
 def test_fitting_for_a_light_prior_lowers_radiance_errors_under_it():

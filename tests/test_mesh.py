@@ -225,6 +225,15 @@ class TestDefects:
         assert counts["open_boundary"] == 3
         assert counts["non_manifold_edges"] == 3
 
+    def test_a_face_the_wrong_way_round_is_told(self):
+        turned = CUBE_FACES.copy()
+        turned[3] = turned[3, ::-1]
+        assert names(cube(faces=turned)) == {"mixed_orientation": 3}
+        # Four faces at an edge, two each way round, are non-manifold but not mixed.
+        shifted = cube().vertices + torch.tensor([2.0, 2.0, 0.0])
+        both = torch.cat([cube().vertices, shifted]), torch.cat([cube().faces, cube().faces + 8])
+        assert names(mesh_from_arrays("two", *both)) == {"non_manifold_edges": 1}
+
     def test_seams_that_only_split_vertices_are_not_open(self):
         soup = torch.tensor(CUBE_VERTICES[CUBE_FACES.ravel()])
         mesh = mesh_from_arrays("soup", soup, torch.arange(36).reshape(-1, 3))

@@ -51,6 +51,9 @@ def test_a_light_prior_has_the_square_of_its_factors_condition():
     one_light[:, 0] = 1.0  # all of the power in one coefficient of nine, and a floor of 1e-3
     (prior,) = solves(transfer, Metric.light_prior(one_light, SphericalHarmonics(3)), [])
     assert prior.condition == pytest.approx((9 + 1e-3) / 1e-3)
+    flat = TransferTensor.from_dense(torch.ones(5, 1), light_basis=SphericalHarmonics(1))
+    (one,) = solves(flat, Metric.light_prior(one_light[:, :1], SphericalHarmonics(1)), [])
+    assert one.condition == 1.0
 
 
 def test_singular_bases_are_told_as_such():

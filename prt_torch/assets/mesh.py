@@ -197,6 +197,7 @@ def mesh_from_raw(
         "duplicate_faces": defects.duplicate_faces,
         "open_boundary": defects.open_edges,
         "non_manifold_edges": defects.non_manifold_edges,
+        "mixed_orientation": defects.twisted_edges,
         "inward_normals": len(faces) if (-defects.side if flip else defects.side) < 0 else 0,
         "flipped": len(faces) if flip and orientation == "outward" else 0,
     }

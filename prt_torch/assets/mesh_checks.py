@@ -23,6 +23,8 @@ _MESSAGES = {
     "duplicate_faces": "{count} faces repeat another face; they only cost time",
     "open_boundary": "{count} edges have one face; the surface is open, and its back is black",
     "non_manifold_edges": "{count} edges join more than two faces; normals there are averages",
+    "mixed_orientation": "{count} edges join faces that show opposite sides; one of the "
+    "two is the wrong way round, and points there are too dark",
     "recomputed_normals": "{count} normals in the file are zero or not finite; computed from faces",
     "split_normals": "{count} vertices have several normals in the file; computed from faces",
     "opposed_normals": "{count} normals in the file point behind their faces; points there may be "

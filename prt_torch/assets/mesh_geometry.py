@@ -162,6 +162,8 @@ class Connectivity:
     """Edges of exactly one face."""
     non_manifold_edges: int
     """Edges of more than two faces."""
+    twisted_edges: int
+    """Edges of two faces that show opposite sides, as both run along it the same way."""
     side: int
     """+1 where faces point outwards, -1 inwards, 0 where the surface has no clear outside."""
 
@@ -175,6 +177,16 @@ def _distinct_rows(
     ordered = rows[np.lexsort(rows.T[::-1])]
     starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1)))
     return ordered[starts], np.diff(np.append(starts, len(rows)))
+
+
+def _twisted(directed: Int64[np.ndarray, "edges 2"]) -> int:
+    """Number of edges that two faces run along the same way, and none the other way."""
+    forward = directed[:, :1] < directed[:, 1:]
+    runs, per_run = _distinct_rows(np.hstack([np.sort(directed, axis=1), forward]))
+    # The two directions of an edge are neighbours.
+    paired = np.append(False, (runs[1:, :2] == runs[:-1, :2]).all(axis=1))
+    one_way = ~(paired | np.append(paired[1:], False))
+    return int((one_way & (per_run == 2)).sum())
 
 
 def welded(
@@ -223,8 +235,9 @@ def connectivity(
 ) -> Connectivity:
     """Count the defects that change what a bake means, and find the side that faces show."""
     corners = welded(vertices)[faces]
-    edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, per_edge = _distinct_rows(edges[edges[:, 0] != edges[:, 1]])
+    directed = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    directed = directed[directed[:, 0] != directed[:, 1]]
+    edges, per_edge = _distinct_rows(np.sort(directed, axis=1))
     _, per_face = _distinct_rows(np.sort(corners, axis=1))
     links = sparse.coo_matrix(
         (np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices), len(vertices))
@@ -238,5 +251,6 @@ def connectivity(
         duplicate_faces=int((per_face - 1).sum()),
         open_edges=int((per_edge == 1).sum()),
         non_manifold_edges=int((per_edge > 2).sum()),
+        twisted_edges=_twisted(directed),
         side=_side(unit, faces, labels[corners[:, 0]], np.unique(labels[edges[per_edge == 1, 0]])),
     )

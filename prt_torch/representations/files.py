@@ -74,7 +74,7 @@ def load(path: Path | str, *, geometry: Surface | None = None) -> Representation
         sha256 = checksum_path(path).read_text().split()[0]
     except (OSError, IndexError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path}: its checksum file {checksum_path(path).name} is missing"
+            f"{path}: its checksum file {checksum_path(path).name} is missing or damaged"
         ) from error
     tensors, header = store.read_tensors(path, sha256)
     kind = header.get("kind") if isinstance(header, dict) else None
