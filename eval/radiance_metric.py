@@ -40,9 +40,6 @@ from prt_torch.errors import InputError
 from prt_torch.metric import Metric
 from prt_torch.representations import CPCA, ClusteredTensor, Representation, ZonalLobes
 from prt_torch.representations.clustered_tensor_coding import Encoding, Parameters
-from prt_torch.representations.clustered_tensor_compression import coding_for
-from prt_torch.representations.zonal_lobes_coding import Lobes
-from prt_torch.representations.zonal_lobes_compression import by_strength, coded
 from prt_torch.sphere import rotation_about_up
 from prt_torch.transfer import TransferTensor
 
@@ -230,14 +227,9 @@ def zonal_curves(judge: Judge, size: tuple[int, ...]) -> Iterator[tuple[str, Poi
     transfer, name = judge.transfer, f"{size[0]} lobes"
     fine = ZonalLobes.from_transfer(transfer, num_lobes=size[0], effort="fast")
     yield "16 bits", judge(name, fine, _stored(fine))
-    parts = [getattr(fine, part).detach() for part in Lobes.names()]
-    lobes, values = by_strength(Lobes(*parts)), transfer.dense().flatten(1, 2)
     for curve, metric in (("codes, l2", Metric.l2(transfer)), ("codes, prior", judge.prior)):
         for share in judge.shares:
-            own, coding = coded(
-                lobes, values, share=share, metric=metric.in_float32(), order=fine.order
-            )
-            found = ZonalLobes(own, None, transfer.surface, fine.shape, coding)
+            found = fine.coded(transfer, share=share, metric=metric)
             yield curve, judge(f"{name} share {share:g}", found, _stored(found))
 
 
@@ -248,15 +240,13 @@ def tensor_curves(judge: Judge, size: tuple[int, ...]) -> Iterator[tuple[str, Po
         model = ClusteredTensor.from_transfer(
             transfer, num_clusters=size[0], ranks=size[1:], bits=None, metric=metric
         )
-        parts = {part: getattr(model, part).detach() for part in Parameters.names()}
-        encoding = Encoding(model.labels, model.groups, Parameters(**parts), None, model.condition)
         if curve == "codes, l2":
-            half = ClusteredTensor(encoding.coded(), transfer.surface, model.shape)
+            parts = {part: getattr(model, part).detach() for part in Parameters.names()}
+            plain = Encoding(model.labels, model.groups, Parameters(**parts), None, model.condition)
+            half = ClusteredTensor(plain.coded(), transfer.surface, model.shape)
             yield "16 bits", judge(name, half, _stored(half))
-        error = 0.0 if model.statistics is None else model.statistics.squared_error
         for share in judge.shares:
-            coding = coding_for(encoding, error, share=share, metric=metric.in_float32())
-            found = ClusteredTensor(encoding, transfer.surface, model.shape, coding)
+            found = model.coded(transfer, share=share, metric=metric)
             yield curve, judge(f"{name} share {share:g}", found, _stored(found))
 
 

@@ -139,14 +139,15 @@ def coarse_grids(transfer: TransferTensor) -> dict[str, dict[str, list[Any]]]:
     rows = transfer.num_rows * transfer.num_channels
     terms = [count for count in (2, 4, 6, 9, 13, 20, 30, 45, 68, 100, 150) if count <= coeffs]
     grids: dict[str, dict[str, list[Any]]] = {
-        "cpca": {"num_clusters": clusters, "rank": ranks},
+        "cpca": {"num_clusters": clusters, "rank": ranks, _SHARE: [None, 1, 4]},
         "segmented_cpca": {"points_per_cluster": [25, 100, 400], "rank": ranks},
         "wavelet": {"num_terms": terms or [1]},
     }
     tensors = [[min(rows, rank), min(coeffs, 2 * rank), rank] for rank in ranks]
-    grids["clustered_tensor"] = {"num_clusters": clusters, "ranks": tensors}
+    codes = {_SHARE: [None, 1]}
+    grids["clustered_tensor"] = {"num_clusters": clusters, "ranks": tensors, **codes}
     if isinstance(transfer.surface.light_basis, SphericalHarmonics):
-        grids["zonal_lobes"] = {"num_lobes": [1, 2, 4], "effort": ["fast"]}
+        grids["zonal_lobes"] = {"num_lobes": [1, 2, 4], "effort": ["fast"], **codes}
     return grids
 
 

@@ -237,6 +237,14 @@ def test_cache_gives_the_same_values_and_is_used(tmp_path):
     assert not other.provenance["projection_cached"]
 
 
+def test_what_is_made_of_older_bits_is_not_used(tmp_path, monkeypatch):
+    small(tiny_scene(), cache=tmp_path)
+    monkeypatch.setattr("prt_torch.baking.visibility._ALGORITHM", -1)
+    again = small(tiny_scene(), cache=tmp_path)
+    assert not again.provenance["visibility_cached"]
+    assert not again.provenance["projection_cached"]
+
+
 def test_memory_budget_is_kept_or_refused():
     mesh = tiny_scene()
     tight = small(mesh, memory_budget=16 * 6 * 16 * 16 * 2 + 4 * 6 * 16 * 16 * 36)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from prt_torch import store
 from prt_torch.assets.mesh import Mesh
-from prt_torch.baking.visibility import Progress, VisibilityField
+from prt_torch.baking.visibility import Progress, VisibilityField, followed
 from prt_torch.bases import LightBasis
 from prt_torch.errors import InputError
 from prt_torch.transfer import Surface, TransferTensor
@@ -57,8 +57,7 @@ def project_points(
 
     basis = surface.light_basis
     described = {
-        "visibility": store.digest(mesh.vertices, mesh.faces, visibility.resolution),
-        "normals": store.digest(mesh.normals),
+        "visibility": store.digest(followed(mesh, visibility.resolution)),
         "light_basis": None if basis is None else basis.describe(),
         **inputs,
     }

@@ -311,16 +311,7 @@ def trace_visibility(
         bits, rays = _trace_in_threads(tracer[0], rows, free.numpy())
         return {"bits": bits}, {"rays": rays, "seconds": time.perf_counter() - start}
 
-    inputs = {
-        "vertices": store.digest(mesh.vertices),
-        "faces": store.digest(mesh.faces),
-        "normals": store.digest(mesh.normals),
-        "texels_per_edge": fine,
-        "ray_offset": _RAY_OFFSET,
-        "algorithm": _ALGORITHM,
-    }
-    if _in_unit_box(mesh)[1]:
-        inputs["box"] = "of faces"  # of all points, in bits kept before this line was added
+    inputs = followed(mesh, fine)
     built = store.build_sharded(
         trace,
         rows=mesh.num_points,
@@ -337,6 +328,25 @@ def trace_visibility(
         built.cached,
         free_points,
     )
+
+
+def followed(mesh: Mesh, resolution: int) -> dict[str, str | int | float]:
+    """What visibility bits follow from, and so all that is made of them.
+
+    Args:
+        mesh: The scene.
+        resolution: Sub-texels along an edge of a cube face.
+    """
+    inputs = {
+        "vertices": store.digest(mesh.vertices),
+        "faces": store.digest(mesh.faces),
+        "normals": store.digest(mesh.normals),
+        "texels_per_edge": resolution,
+        "ray_offset": _RAY_OFFSET,
+        "algorithm": _ALGORITHM,
+    }
+    # Of all points, in bits kept before this was added.
+    return {**inputs, "box": "of faces"} if _in_unit_box(mesh)[1] else inputs
 
 
 def _trace_in_threads(
