@@ -1,6 +1,7 @@
 """A run's account of itself: errors, bytes, times, pictures and what was left out."""
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from prt_torch.representations import (
     CPCA,
     ClusteredTensor,
     DenseTransfer,
+    Representation,
     SegmentedCPCA,
 )
 from prt_torch.representations.cpca_relabel import coherence
@@ -81,37 +83,48 @@ def write_report(
         *_left_out_segments(transfer, fitted),
     ]
     report["solves"] = [solve.entry() for solve in solved]
-    report["results"] = []
-    for one in fitted:
-        lost = float(errors[one.name].sum())
-        result = {
-            "name": one.name,
-            "representation": one.representation.kind,
-            "parameters": one.representation.budget,
-            "status": one.status,
-            "fit_seconds": one.seconds,
-            "bytes": sum(one.representation.storage().values()),
-            "transfer_error": lost / (float(norms.sum()) or 1.0),
-            "reference_error": evaluate.reference_error(lost, transfer),
+    report["results"] = [
+        {
+            **_worth(one, transfer, float(errors[one.name].sum()), float(norms.sum())),
             "radiance_error": radiance_errors[one.name],
-            "condition": one.condition,
             "relight_seconds": times[one.name],
             "dense_seconds": dense_seconds,
+            **({"dense_scaled": True} if scaled else {}),
             "peak_bytes": evaluate.peak_bytes(
-                lambda one=one: relighters[one.name](projected[0][None], first_view)
+                partial(relighters[one.name], projected[0][None], first_view)
             ),
+            **_coherence(one.representation, inputs.mesh.faces),
         }
-        if scaled:
-            result["dense_scaled"] = True
-        match one.representation:
-            case CPCA() as model:
-                result["coherence"] = coherence(model, inputs.mesh.faces)
-            case ClusteredTensor() as model:
-                result["coherence"] = model.coherence(inputs.mesh.faces)
-        report["results"].append(result)
+        for one in fitted
+    ]
     store.write_json(out / "report.json", report)
     write_html(out / "report.html", report, pictures)
     return report
+
+
+def _worth(one: Fitted, transfer: TransferTensor, lost: float, norm: float) -> dict[str, Any]:
+    """A result with its squared error, that of the transfer it stands for."""
+    return {
+        "name": one.name,
+        "representation": one.representation.kind,
+        "parameters": one.representation.budget,
+        "status": one.status,
+        "fit_seconds": one.seconds,
+        "bytes": sum(one.representation.storage().values()),
+        "transfer_error": lost / (norm or 1.0),
+        "reference_error": evaluate.reference_error(lost, transfer),
+        "condition": one.condition,
+    }
+
+
+def _coherence(model: Representation, faces: Tensor) -> dict[str, Any]:
+    """How often a face is drawn, of clusters that a renderer draws one by one."""
+    match model:
+        case CPCA():
+            return {"coherence": coherence(model, faces)}
+        case ClusteredTensor():
+            return {"coherence": model.coherence(faces)}
+    return {}
 
 
 @torch.no_grad()

@@ -112,7 +112,8 @@ def _title(report: Mapping[str, Any]) -> str:
 def _summary(report: Mapping[str, Any], rows: Sequence[Outcome]) -> str:
     all_runs = runs(report)
     bases = dict.fromkeys(str(run.light.get("basis", "")) for run in all_runs)
-    lead = f"{len(rows)} compressed representations of precomputed transfer, light in "
+    plural = "" if len(rows) == 1 else "s"
+    lead = f"{len(rows)} compressed representation{plural} of precomputed transfer, light in "
     lead += ", ".join(basis for basis in bases if basis) or "an unnamed basis"
     facts = "".join(f'<div class="facts">{_facts(run)}</div>' for run in all_runs)
     noted = "".join(f"<li>{escape(message)}</li>" for message in _warnings(all_runs))
