@@ -36,11 +36,8 @@ from prt_torch.representations.clustered_tensor_coding import (
 from prt_torch.representations.clustered_tensor_compression import TensorCoding, coding_for
 from prt_torch.representations.clustered_tensor_compression import pack as compressed
 from prt_torch.representations.clustered_tensor_compression import unpack as decompressed
-from prt_torch.representations.clustered_tensor_encoding import (
-    Options,
-    TensorStatistics,
-    encode,
-)
+from prt_torch.representations.clustered_tensor_encoding import Options, encode
+from prt_torch.representations.clustered_tensor_statistics import TensorStatistics
 from prt_torch.representations.coherence import draws, registers
 from prt_torch.representations.grouped import ClusterBlocks, sort_labels
 from prt_torch.representations.processes import Processes
@@ -173,10 +170,10 @@ class ClusteredTensor(CodedRepresentation):
             start from those of the turn before; all of it works in the principal axes of view and
             light that matter.
         """
-        _check(num_clusters, ranks, bits, tolerance, max_turns)
+        if bits not in (BITS, None):
+            raise ValueError(f"expected 16 bits or None, got {bits!r}")
         if quantisation_share is not None and not quantisation_share > 0.0:
             raise ValueError(f"expected a positive share, got {quantisation_share}")
-        rows, coeffs, points = ranks
         processes = Processes(process_group)
         options = Options(
             tolerance=tolerance,
@@ -186,9 +183,8 @@ class ClusteredTensor(CodedRepresentation):
             generator=generator or torch.Generator().manual_seed(0),
             processes=processes,
         )
-        wanted = (rows, coeffs, points)
         encoding, statistics = encode(
-            transfer, num_clusters=num_clusters, ranks=wanted, options=options
+            transfer, num_clusters=num_clusters, ranks=ranks, options=options
         )
         if bits is not None and quantisation_share is None:
             encoding = encoding.coded(processes)
@@ -419,19 +415,3 @@ class ClusteredTensor(CodedRepresentation):
     def condition(self) -> float:
         """Largest over smallest kept singular value, of the worst cluster; NaN if loaded."""
         return self._condition
-
-
-def _check(
-    num_clusters: int, ranks: Sequence[int], bits: int | None, tolerance: float, max_turns: int
-) -> None:
-    """Whether the options of :meth:`ClusteredTensor.from_transfer` are in range."""
-    if num_clusters < 1:
-        raise ValueError(f"expected at least 1 cluster, got {num_clusters}")
-    if len(ranks) != 3 or min(ranks) < 1:
-        raise ValueError(f"expected three ranks of at least 1, got {tuple(ranks)}")
-    if bits not in (BITS, None):
-        raise ValueError(f"expected 16 bits or None, got {bits!r}")
-    if not 0.0 <= tolerance < 1.0:
-        raise ValueError(f"expected a tolerance in 0..1, got {tolerance}")
-    if max_turns < 1:
-        raise ValueError(f"expected at least 1 turn, got {max_turns}")

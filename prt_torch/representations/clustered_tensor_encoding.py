@@ -16,8 +16,6 @@ Source:
     Tsai, Shih 2006, section 5.2. The projection is ours.
 """
 
-import itertools
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -51,6 +49,7 @@ from prt_torch.representations.clustered_tensor_search import (
     find_clusters,
     first_clusters,
 )
+from prt_torch.representations.clustered_tensor_statistics import Clock, TensorStatistics
 from prt_torch.representations.magnitude import of_ordinary_magnitude
 from prt_torch.representations.points import Mapped, Points, SortedPoints, label_type, slices
 from prt_torch.representations.processes import ALONE, Processes
@@ -67,55 +66,6 @@ _START_TABLES = 6  # as large as the vectors of the first clusters
 
 
 @dataclass(frozen=True)
-class TensorStatistics:
-    """What an encoding did; squared errors in the metric.
-
-    Of several groups, turns are counted side by side, a group that is done staying where it is.
-
-    Attributes:
-        squared_norm: Of the transfer.
-        squared_error: Of the approximation, rounding to codes aside.
-        projection_lost: Share of the squared norm that lies beyond the axes of light and view that
-            were kept, part of the squared error.
-        axes: Of view and light that the work was done in, in the group of most.
-        errors: After each turn: of the clustering phase, then of the approximation phase.
-        moved: Points that moved in each turn of the clustering phase.
-        seconds: Of the phases: ``reading``, ``start``, ``clustering``, ``approximation``,
-            ``weights``.
-    """
-
-    squared_norm: float
-    squared_error: float
-    projection_lost: float
-    axes: tuple[int, int]
-    errors: list[float]
-    moved: list[int]
-    seconds: dict[str, float]
-
-    @classmethod
-    def together(
-        cls, groups: Sequence["TensorStatistics"], seconds: dict[str, float], power: float
-    ) -> "TensorStatistics":
-        """Of all groups; ``seconds`` are those of the whole, errors in ``power`` times its unit."""
-        norm = sum(one.squared_norm for one in groups)
-        lost = sum(one.projection_lost * one.squared_norm for one in groups)
-        turns = range(max(len(one.errors) for one in groups))
-        moved = itertools.zip_longest(*(one.moved for one in groups), fillvalue=0)
-        return cls(
-            squared_norm=norm / power / power,
-            squared_error=sum(one.squared_error for one in groups) / power / power,
-            projection_lost=lost / (norm or 1.0),
-            axes=(max(one.axes[0] for one in groups), max(one.axes[1] for one in groups)),
-            errors=[
-                sum(one.errors[min(t, len(one.errors) - 1)] for one in groups) / power / power
-                for t in turns
-            ],
-            moved=[sum(counts) for counts in moved],
-            seconds=seconds,
-        )
-
-
-@dataclass(frozen=True)
 class Ranks:
     """Ranks of the three modes, capped at what exists."""
 
@@ -125,7 +75,7 @@ class Ranks:
 
     @classmethod
     def capped(
-        cls, ranks: tuple[int, int, int], num_points: int, view_axes: int, num_coeffs: int
+        cls, ranks: Sequence[int], num_points: int, view_axes: int, num_coeffs: int
     ) -> "Ranks":
         """No mode has more than its size or than the product of the other two.
 
@@ -141,20 +91,6 @@ class Ranks:
         return cls(view, light, min(points, view * light))
 
 
-class _Clock:
-    """Seconds of phases, one after the other."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def tick(self, phase: str) -> None:
-        """The time since the last tick belongs to this phase."""
-        now = time.perf_counter()
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self._last
-        self._last = now
-
-
 @dataclass(frozen=True)
 class Options:
     """What a fit is told, shared by all groups.
@@ -166,6 +102,9 @@ class Options:
         metric: What errors are worth.
         generator: Source of randomness.
         processes: Those that have points too.
+
+    Raises:
+        ValueError: If the tolerance or the number of turns is out of range.
     """
 
     tolerance: float
@@ -175,20 +114,31 @@ class Options:
     generator: torch.Generator
     processes: Processes = ALONE
 
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.tolerance < 1.0:
+            raise ValueError(f"expected a tolerance in 0..1, got {self.tolerance}")
+        if self.max_turns < 1:
+            raise ValueError(f"expected at least 1 turn, got {self.max_turns}")
+
 
 def encode(
     transfer: TransferTensor,
     *,
     num_clusters: int,
-    ranks: tuple[int, int, int],
+    ranks: Sequence[int],
     options: Options,
 ) -> tuple[Encoding, TensorStatistics]:
     """Cluster the points of a transfer tensor and decompose each cluster; nothing is rounded.
 
     Raises:
+        ValueError: If a number of clusters or a rank is below 1, or there are not three ranks.
         InputError: If the memory budget is too small, or there are fewer clusters than materials.
     """
-    clock, processes = _Clock(), options.processes
+    if num_clusters < 1:
+        raise ValueError(f"expected at least 1 cluster, got {num_clusters}")
+    if len(ranks) != 3 or min(ranks) < 1:
+        raise ValueError(f"expected three ranks of at least 1, got {tuple(ranks)}")
+    clock, processes = Clock(), options.processes
     memory = Memory(options.memory_budget)
     transfer, power = of_ordinary_magnitude(transfer, memory, processes)
     groups = split(transfer, processes)
@@ -230,7 +180,7 @@ class _Group:
     rank: Ranks
     num_clusters: int
     options: Options
-    clock: _Clock
+    clock: Clock
 
     def encode(self) -> tuple[Encoding, TensorStatistics]:
         """All phases."""
