@@ -4,7 +4,8 @@
    (:mod:`prt_torch.nesting`).
 2. *Refine*: in the families that may still win, lines through the best are followed: where a value
    of a parameter keeps the limits and the next does not, one between them is fitted, a few times
-   over. A family whose best is far above that of another is left as it is.
+   over; codes may also become finer or coarser than any tried. A family whose best is far above
+   that of another is left as it is.
 3. *Pick*: the least error among all that keep the limits; where the error is limited, the fewest
    bytes.
 
@@ -214,7 +215,8 @@ def refine(problem: Problem, limits: Limits, tried: Sequence[Tried]) -> Choice:
                 continue
             skipped.pop(kind, None)
             own = [other for other in every if other.kind == kind]
-            wanted += [(kind, given) for given in _between(own, one, limits)]
+            proposed = [*_between(own, one, limits), *_beyond(own, one, limits)]
+            wanted += [(kind, given) for given in proposed]
         fresh = [(kind, given) for kind, given in wanted if _key(kind, given) not in known]
         if not fresh:
             break
@@ -285,6 +287,22 @@ def _between(tried: Sequence[Tried], best: Tried, limits: Limits) -> list[Parame
             if middle is not None:
                 proposed.append({**best.parameters, name: middle})
     return proposed
+
+
+def _beyond(tried: Sequence[Tried], best: Tried, limits: Limits) -> list[Parameters]:
+    """The best in codes finer than it was tried in; in coarser ones where bytes are to fall."""
+    others, share = _but_share(best)
+    shares = [own for rest, own in map(_but_share, tried) if rest == others and own is not None]
+    finer = limits.error is None
+    if share is None or share != (min(shares) if finer else max(shares)):
+        return []
+    return [{**others, _SHARE: share / 2.0 if finer else share * 2.0}]
+
+
+def _but_share(one: Tried) -> tuple[Parameters, float | None]:
+    """Its parameters, the share of codes apart."""
+    others = {name: value for name, value in one.parameters.items() if name != _SHARE}
+    return others, one.parameters.get(_SHARE)
 
 
 def _values_near(best: Tried, name: str, tried: Sequence[Tried], count: int) -> list[Any]:
