@@ -217,6 +217,12 @@ def test_points_that_cannot_be_read_off_are_fitted():
     assert all(fitted == point for point, fitted in chain.plan())
 
 
+def test_of_nearly_all_dimensions_fewer_are_fitted_anew():
+    (chain,) = chains("cpca", {"rank": [28, 24, 20, 14]})
+    assert [fitted["rank"] for _, fitted in chain.plan(size=36)] == [28, 28, 20, 20]
+    assert [fitted["rank"] for _, fitted in chain.plan(size=250)] == [28, 28, 28, 14]
+
+
 def test_codes_of_all_shares_are_made_of_the_same_fits():
     grid = {"num_clusters": [4], "rank": [8, 7, 2], "quantisation_share": [4, None, 1]}
     (chain,) = chains("cpca", grid)
