@@ -334,6 +334,18 @@ def test_killed_chain_ends_as_if_it_had_not_been(tmp_path, monkeypatch, stop_aft
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
 
 
+def test_nothing_is_read_off_what_was_read_off_itself(tmp_path):
+    """As a point that a budget picks, whose numbers are there, but of a larger fit."""
+    problem, judge = Problem(smooth_transfer(150)), judge_of(smooth_transfer(150))
+    after, alone = Kept(tmp_path / "after"), Kept(tmp_path / "alone")
+    (chain,) = chains("cpca", {"num_clusters": [12], "rank": [3, 2], "quantisation_share": [None]})
+    run_chain(problem, chain, after, judge)
+    picked = {"num_clusters": 12, "rank": 2, "quantisation_share": 2.0}
+    for kept in (after, alone):
+        run_chain(problem, Chain("cpca", picked), kept, judge)
+    assert after.path("cpca", picked).read_bytes() == alone.path("cpca", picked).read_bytes()
+
+
 def test_judge_against_definitions():
     transfer = smooth_transfer(60)
     judge = judge_of(transfer)

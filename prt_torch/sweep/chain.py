@@ -60,6 +60,11 @@ class Kept:
             return None
         return load(self.path(kind, parameters), geometry=self._geometry)
 
+    def fitted(self, kind: str, parameters: Parameters) -> Representation | None:
+        """The representation of a point that is done and was not read off a larger one."""
+        record = self.record(kind, parameters)
+        return None if record is None or record["read_off"] else self.model(kind, parameters)
+
     def keep(self, kind: str, made: Made, worth: dict[str, Any]) -> None:
         """Write a point: its representation first, its record last."""
         path = self.path(kind, made.parameters)
@@ -84,7 +89,7 @@ def run_chain(problem: Problem, chain: Chain, kept: Kept, judge: Judge) -> int:
         problem,
         chain,
         done=lambda parameters: kept.record(chain.kind, parameters) is not None,
-        fitted=lambda parameters: kept.model(chain.kind, parameters),
+        fitted=lambda parameters: kept.fitted(chain.kind, parameters),
     ):
         before = kept.record(chain.kind, made.fitted) or {}
         condition = before.get("condition") if math.isnan(made.condition) else made.condition
