@@ -23,7 +23,7 @@ import torch
 
 from prt_torch import evaluate
 from prt_torch.bases import SphericalHarmonics
-from prt_torch.construction import Parameters, Problem, closed_form
+from prt_torch.construction import SHARE, Parameters, Problem, closed_form
 from prt_torch.errors import InputError
 from prt_torch.nesting import chains, nested
 from prt_torch.relight import Relighter
@@ -33,7 +33,6 @@ from prt_torch.transfer import TransferTensor
 Grids = Mapping[str, Mapping[str, Sequence[Any]]]
 """Values of each parameter, by kind."""
 
-_SHARE = "quantisation_share"
 _NEAR_SHARE = 1.15  # shares within this factor hardly differ in bytes
 _HOPEFUL = 3.0  # families whose best is within this factor of the best of all are refined
 _ROUNDS = 4
@@ -140,12 +139,12 @@ def coarse_grids(transfer: TransferTensor) -> dict[str, dict[str, list[Any]]]:
     rows = transfer.num_rows * transfer.num_channels
     terms = [count for count in (2, 4, 6, 9, 13, 20, 30, 45, 68, 100, 150) if count <= coeffs]
     grids: dict[str, dict[str, list[Any]]] = {
-        "cpca": {"num_clusters": clusters, "rank": ranks, _SHARE: [None, 1, 4]},
+        "cpca": {"num_clusters": clusters, "rank": ranks, SHARE: [None, 1, 4]},
         "segmented_cpca": {"points_per_cluster": [25, 100, 400], "rank": ranks},
         "wavelet": {"num_terms": terms or [1]},
     }
     tensors = [[min(rows, rank), min(coeffs, 2 * rank), rank] for rank in ranks]
-    codes = {_SHARE: [None, 1]}
+    codes = {SHARE: [None, 1]}
     grids["clustered_tensor"] = {"num_clusters": clusters, "ranks": tensors, **codes}
     if isinstance(transfer.surface.light_basis, SphericalHarmonics):
         grids["zonal_lobes"] = {"num_lobes": [1, 2, 4], "effort": ["fast"], **codes}
@@ -296,13 +295,13 @@ def _beyond(tried: Sequence[Tried], best: Tried, limits: Limits) -> list[Paramet
     finer = limits.error is None
     if share is None or share != (min(shares) if finer else max(shares)):
         return []
-    return [{**others, _SHARE: share / 2.0 if finer else share * 2.0}]
+    return [{**others, SHARE: share / 2.0 if finer else share * 2.0}]
 
 
 def _but_share(one: Tried) -> tuple[Parameters, float | None]:
     """Its parameters, the share of codes apart."""
-    others = {name: value for name, value in one.parameters.items() if name != _SHARE}
-    return others, one.parameters.get(_SHARE)
+    others = {name: value for name, value in one.parameters.items() if name != SHARE}
+    return others, one.parameters.get(SHARE)
 
 
 def _values_near(best: Tried, name: str, tried: Sequence[Tried], count: int) -> list[Any]:
@@ -324,7 +323,7 @@ def _choices(one: Tried) -> Parameters:
 
 def _is_size(name: str, value: Any) -> bool:
     """Whether there are others between two: whole numbers, lists of them, and shares."""
-    if name == _SHARE:
+    if name == SHARE:
         return value is not None
     parts = value if isinstance(value, list | tuple) else [value]
     return all(type(part) is int for part in parts)
@@ -336,7 +335,7 @@ def _size(value: Any) -> float:
 
 def _middle(name: str, low: Any, high: Any) -> Any:
     """Between two values, None where there is nothing between."""
-    if name == _SHARE:
+    if name == SHARE:
         middle = float(f"{math.sqrt(low * high):.3g}")
         return middle if high > _NEAR_SHARE * low > 0.0 else None
     if isinstance(low, list | tuple):

@@ -59,19 +59,25 @@ def closed_form(problem: Problem, kind: str, parameters: Parameters) -> Represen
     return KINDS[kind].from_transfer(problem.transfer, **parameters, **common)
 
 
-_NUMBERS: dict[str, Parameters] = {
-    "cpca": {"quantisation_share": None},
-    "clustered_tensor": {"quantisation_share": None, "bits": None},
-    "zonal_lobes": {"quantisation_share": None, "bits": None},
+SHARE = "quantisation_share"
+"""Of the error, that codes may add: a parameter of several kinds."""
+
+NO_CODES: dict[str, Parameters] = {
+    "cpca": {SHARE: None},
+    "segmented_cpca": {SHARE: 0.0},
+    "clustered_tensor": {SHARE: None, "bits": None},
+    "scattered_srbf": {"bits": None},
+    "zonal_lobes": {SHARE: None, "bits": None},
+    "wavelet": {"codes": "float"},
 }
-"""What keeps numbers as they are, of kinds that can be put in compressed codes."""
+"""What keeps numbers as they are; those whose share is then None can be put in compressed codes."""
 
 
 def before_codes(kind: str, parameters: Parameters) -> Parameters:
     """Parameters of the closed form whose numbers these compress; the same if they do not."""
-    share = parameters.get("quantisation_share")
-    compressed = kind in _NUMBERS and share is not None
-    return {**parameters, **_NUMBERS[kind]} if compressed else parameters
+    plain = NO_CODES.get(kind, {})
+    compressed = plain.get(SHARE, 0.0) is None and parameters.get(SHARE) is not None
+    return {**parameters, **plain} if compressed else parameters
 
 
 def in_codes(problem: Problem, model: Representation, parameters: Parameters) -> Representation:
@@ -81,6 +87,5 @@ def in_codes(problem: Problem, model: Representation, parameters: Parameters) ->
         ValueError: If the kind cannot be compressed.
     """
     if not isinstance(model, CPCA | ClusteredTensor | ZonalLobes):
-        raise ValueError(f"expected one of {', '.join(_NUMBERS)} to compress, got {model.kind}")
-    share = parameters["quantisation_share"]
-    return model.coded(problem.transfer, share=share, metric=problem.metric)
+        raise ValueError(f"expected numbers that can be compressed, got {model.kind}")
+    return model.coded(problem.transfer, share=parameters[SHARE], metric=problem.metric)

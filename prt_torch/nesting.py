@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from prt_torch.construction import Parameters, Problem, before_codes, closed_form, in_codes
+from prt_torch.construction import SHARE, Parameters, Problem, before_codes, closed_form, in_codes
 from prt_torch.reductions import (
     fewer_functions,
     fewer_segment_vectors,
@@ -37,8 +37,6 @@ from prt_torch.representations import (
     SegmentedCPCA,
     WaveletTransfer,
 )
-
-_SHARE = "quantisation_share"
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ class Chain:
     def points(self) -> list[Parameters]:
         """Parameters of every point, in the order they are made."""
         axes = [] if self.axis is None else [{self.axis: value} for value in self.values]
-        codes = [{_SHARE: share} for share in self.shares]
+        codes = [{SHARE: share} for share in self.shares]
         pairs = itertools.product(axes or [{}], codes or [{}])
         return [{**self.fixed, **along, **share} for along, share in pairs]
 
@@ -172,8 +170,8 @@ def chains(kind: str, grid: Mapping[str, Sequence[Any]]) -> list[Chain]:
     nesting = NESTINGS.get(kind)
     axis = nesting.axis if nesting and nesting.axis in grid else None
     values = sorted(grid[axis], key=_sizes, reverse=True) if axis else []
-    codes = _codes(kind, grid.get(_SHARE, []))
-    others = [name for name in grid if name != axis and not (any(codes) and name == _SHARE)]
+    codes = _codes(kind, grid.get(SHARE, []))
+    others = [name for name in grid if name != axis and not (any(codes) and name == SHARE)]
     return [
         Chain(kind, dict(zip(others, choice, strict=True)), axis, tuple(values), shares)
         for choice in itertools.product(*(grid[name] for name in others))
@@ -183,12 +181,12 @@ def chains(kind: str, grid: Mapping[str, Sequence[Any]]) -> list[Chain]:
 
 def _codes(kind: str, shares: Sequence[float | None]) -> list[tuple[float | None, ...]]:
     """Shares whose points are made of the same numbers; one empty group if codes do not differ."""
-    numbers = before_codes(kind, {_SHARE: 1.0})
-    if not shares or numbers[_SHARE] is not None:
+    numbers = before_codes(kind, {SHARE: 1.0})
+    if not shares or numbers[SHARE] is not None:
         return [()]
     coded = tuple(sorted(share for share in shares if share is not None))
     plain = (None,) if None in shares else ()
-    if numbers == {_SHARE: None}:  # what is not compressed keeps these numbers
+    if numbers == {SHARE: None}:  # what is not compressed keeps these numbers
         return [plain + coded]
     return [group for group in (plain, coded) if group]
 

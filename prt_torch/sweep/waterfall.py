@@ -23,7 +23,14 @@ from torch import Tensor
 from prt_torch import evaluate
 from prt_torch.baking import bake
 from prt_torch.bases import CubeDirections
-from prt_torch.construction import Parameters, Problem, before_codes, closed_form, in_codes
+from prt_torch.construction import (
+    NO_CODES,
+    Parameters,
+    Problem,
+    before_codes,
+    closed_form,
+    in_codes,
+)
 from prt_torch.inputs import Inputs
 from prt_torch.preview import Camera
 from prt_torch.relight import Relighter
@@ -48,14 +55,6 @@ _ONE_CLUSTER: dict[str, Parameters] = {
     "cpca": {"num_clusters": 1},
     "segmented_cpca": {"points_per_cluster": 2**31},
     "clustered_tensor": {"num_clusters": 1},
-}
-_NO_CODES: dict[str, Parameters] = {
-    "cpca": {"quantisation_share": None},
-    "segmented_cpca": {"quantisation_share": 0.0},
-    "clustered_tensor": {"bits": None, "quantisation_share": None},
-    "scattered_srbf": {"bits": None},
-    "zonal_lobes": {"bits": None, "quantisation_share": None},
-    "wavelet": {"codes": "float"},
 }
 
 
@@ -103,7 +102,7 @@ def error_stages(
 
 def _models(problem: Problem, kind: str, parameters: Parameters) -> dict[str, Representation]:
     """Clusters, rank and codes, as far as the kind has them."""
-    uncoded, found = {**parameters, **_NO_CODES.get(kind, {})}, {}
+    uncoded, found = {**parameters, **NO_CODES.get(kind, {})}, {}
     if kind in _LEAST:
         found["clusters"] = closed_form(problem, kind, {**uncoded, **_LEAST[kind]})
     name = "rank" if kind in _LEAST else kind
@@ -129,7 +128,7 @@ def _alone(
     together: dict[str, Tensor],
 ) -> dict[str, Tensor]:
     """The truth as clusters, rank and codes would change it with nothing else."""
-    uncoded, found = {**parameters, **_NO_CODES.get(kind, {})}, {}
+    uncoded, found = {**parameters, **NO_CODES.get(kind, {})}, {}
     uncompressed, name = scene.dense(problem.transfer), "rank" if kind in _LEAST else kind
     if kind in _LEAST:
         found["clusters"] = truth + together["clusters"] - uncompressed
